@@ -14,6 +14,7 @@ from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.options.config_file import laser_parameters, live_parameters, mapping_parameters
 from taichi_mrf.cli.options.diff import Diff
+from taichi_mrf.cli.options.doctor import Doctor
 from taichi_mrf.cli.options.eval import Eval
 from taichi_mrf.cli.options.export import Export
 from taichi_mrf.cli.options.import_map import Import
@@ -109,6 +110,7 @@ COMMANDS = {
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),
     "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),
     "info": Command(Info, "taichi_mrf.cli.info:run_info"),
+    "doctor": Command(Doctor, "taichi_mrf.cli.doctor:run_doctor"),
     "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench", None, _BENCH_FLAGS),
     "calibrate": Command(Calibrate, "taichi_mrf.cli.calibrate:run_calibrate"),
     "eval": Command(Eval, "taichi_mrf.cli.eval:run_eval"),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.overlap import seen_again
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -111,15 +112,9 @@ def _difference(
     v, u = np.nonzero(first > 0)
     some = slice(None, None, max(1, len(v) // _SAMPLES))
     v, u = v[some], u[some]
-    points = camera.rays()[v, u] * (first[v, u] / scale)[:, None]
-    x, y, z = (points @ T_second_first[:3, :3].T + T_second_first[:3, 3]).T
-    ahead = z > 1e-3
-    x, y, z = x[ahead], y[ahead], z[ahead]
-    column = np.rint(camera.fx * x / z + camera.cx)
-    row = np.rint(camera.fy * y / z + camera.cy)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    seen = second[row[inside].astype(int), column[inside].astype(int)] / scale
-    both = seen > 0
+    points = camera.directions(u, v) * (first[v, u] / scale)[:, None]
+    seen = seen_again(points, T_second_first, second / scale, camera)
+    both = seen.measured > 0
     if both.sum() < min(_LEAST_SAMPLES, len(v) // 4):
         return float("nan")
-    return float(np.median(np.abs(z[inside][both] - seen[both]) / seen[both]))
+    return float(np.median(np.abs(seen.expected[both] - seen.measured[both]) / seen.measured[both]))

@@ -13,6 +13,7 @@ can still be used.
 
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.pose_text import Line, in_seconds, lines_of_numbers, numbers_in, split
+from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -60,7 +62,8 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a file of poses, recognising its layout by the first line. Warns of stamps that come twice.
+    """Read a file of poses, recognising its layout by the first line. Warns of stamps that come twice, and of
+    a clock that starts again, of whose runs the longest is read.
 
     Raises DatasetError, whose text names the file and the line, if it cannot be read, contains no pose,
     or a line has too few or too many numbers or something that is not a number.
@@ -70,7 +73,7 @@ def read_trajectory(path: Path) -> Trajectory:
         raise DatasetError(f"{path}: contains no pose")
     columns = len(lines[0][1])
     if columns == 8:
-        poses = tuple(_stamped(path, line) for line in lines)
+        poses = _longest_run(path, tuple(_stamped(path, line) for line in lines))
         _warn_of_twice(path, poses)
         return Trajectory(path, "stamped", poses)
     if columns in (7, 12, 16):
@@ -83,6 +86,25 @@ def read_trajectory(path: Path) -> Trajectory:
         "stamp), 12 or 16 (a matrix), or 3 (the head of a .log block); a first line such as "
         "'stamp,tx,ty,tz,qw,qx,qy,qz' may name other columns"
     )
+
+
+_SHORTEST_RUN = 5
+"""Stamps that go back after fewer lines are in no order; with more lines a clock has started again."""
+
+
+def _longest_run(path: Path, poses: tuple[RecordedPose, ...]) -> tuple[RecordedPose, ...]:
+    bounds = [*starts_of_runs([pose.key for pose in poses]), len(poses)]
+    if len(bounds) < 3 or min(np.diff(bounds)) < _SHORTEST_RUN:
+        return poses
+    runs = [poses[first:stop] for first, stop in pairwise(bounds)]
+    longest = max(runs, key=len)
+    begins = ", ".join(f"{run[0].source.removeprefix(f'{path} ')} ({len(run)} poses)" for run in runs)
+    warnings.warn(
+        f"{path}: its clock starts again, with runs from {begins}: only the longest is read; a file of "
+        "another run alone is read as that",
+        stacklevel=2,
+    )
+    return longest
 
 
 def valid_poses(trajectory: Trajectory) -> tuple[list[float], list[Pose]]:

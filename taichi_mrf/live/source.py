@@ -16,6 +16,7 @@ from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
@@ -112,6 +113,8 @@ def open_source(
     if not config.color and METHODS[config.method].has_colors:
         note_unused_color(dataset, name, reading or SourceFlags())
     config = with_recorded_noise(config, dataset)
+    found = mistakes_at_a_glance(dataset)
+    dataset.notes += [f"frames contradict each other: {'; '.join(found)}"] if found else []
     learnt = None if learn_noise is None else learn_noise(dataset, config)
     if learnt is not None:
         config = learnt.put_into(config)

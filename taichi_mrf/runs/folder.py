@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
+from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.noise_check import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
@@ -35,7 +36,7 @@ from taichi_mrf.runs.files import (
     WINDOW_FOLDER,
     remove_files_of_earlier_run,
 )
-from taichi_mrf.runs.noise import noise_notes, noise_report, sensor_yaml
+from taichi_mrf.runs.noise import contradicts, noise_notes, noise_report, sensor_yaml
 from taichi_mrf.runs.report import report_json, rounded, run_report, unfinished_report
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import write_text
@@ -92,12 +93,16 @@ class RunFacts:
     learnt: LearntSigma | None = None
 
     def report(
-        self, result: MappingResult, check: HeldOutCheck | None, noise: NoiseCheck | None = None
+        self,
+        result: MappingResult,
+        check: HeldOutCheck | None,
+        noise: NoiseCheck | None = None,
+        mistakes: Sequence[str] = (),
     ) -> dict[str, Any]:
         """The report of the finished run."""
         report = run_report(result, self.dataset, self.source, check)
         report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
-        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt)
+        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt, mistakes)
         told = (str(warning.message) for warning in self.warned)
         report["notes"] = list(dict.fromkeys([*report["notes"], *told]))
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
@@ -142,7 +147,11 @@ def write_run(
             with result.timed("checking"):
                 result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
-    report = facts.report(result, found, noise)
+    seen: list[str] = []
+    if posed is not None and contradicts(noise) and not haste.hurried:
+        with result.timed("checking"):
+            seen = mistakes(posed)
+    report = facts.report(result, found, noise, seen)
     if not occupied:
         report["notes"].append(_nothing_occupied(facts.config))
     if chunked is not None:

@@ -1,5 +1,6 @@
 """What a run says of its noise: whether held-out frames agree with it, and what was learnt of it."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,9 @@ from taichi_mrf.calibration.from_recording import NOISE, LearntSigma
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.evaluation.noise_check import NoiseCheck
 from taichi_mrf.evaluation.noise_fit import SigmaLaw
+
+NO_NOISE = 8.0
+"""No sensor's noise differs from a stated one by so large a factor: what is wrong is something else."""
 
 
 def noise_report(
@@ -37,8 +41,18 @@ def noise_report(
     return report
 
 
-def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None) -> list[str]:
-    """The same in sentences."""
+def contradicts(check: NoiseCheck | LearntSigma | None) -> bool:
+    """Whether held-out frames contradict their map so much that no sensor's noise explains it."""
+    return check is not None and check.factor > NO_NOISE
+
+
+def noise_notes(
+    sensor: SensorConfig,
+    check: NoiseCheck | None,
+    learnt: LearntSigma | None,
+    mistakes: Sequence[str] = (),
+) -> list[str]:
+    """The same in sentences; ``mistakes`` are what a doctor finds in a recording that contradicts its map."""
     notes = []
     if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
         notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")
@@ -51,11 +65,14 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
     if learnt is not None and learnt.prior:
         changed = ", ".join(f"inference.{name} is {value:g}" for name, value in learnt.prior.items())
         notes.append(f"Rays are long: {changed}, with which held-out measurements are likelier.")
-    if check is not None and check.wrong:
+    if check is not None and check.wrong and mistakes:
+        by = f"{check.factor:.2g} times what {_noise_name(sensor)} allows"
+        notes.append(f"{check.frames} held-out frames contradict the map, by {by}: {'; '.join(mistakes)}.")
+    elif check is not None and check.wrong:
         notes.append(
             f"The measured depths of {check.frames} held-out frames differ from the map by "
             f"{check.factor:.2g} times what {_noise_name(sensor)} allows{_better(check.law)}. "
-            f"{_advice(sensor, learnt)}"
+            f"{_advice(sensor, learnt, check)}"
         )
     return notes
 
@@ -87,7 +104,9 @@ def _better(law: SigmaLaw | None) -> str:
     return f"; likeliest is {law.scale:.2g} times the stated sigma and {100 * law.added_m:.2g} cm"
 
 
-def _advice(sensor: SensorConfig, learnt: LearntSigma | None) -> str:
+def _advice(sensor: SensorConfig, learnt: LearntSigma | None, check: NoiseCheck) -> str:
     if learnt is not None or sensor.sigma_scale != 1 or sensor.sigma_added:
         return "It was learnt from other frames than these: poses or the scene differ along the recording."
+    if contradicts(check):
+        return "Poses may be off, or the recording is not what it is taken for: see taichi-mrf doctor SOURCE."
     return "Poses may be off, or the noise is another sensor's; --noise auto learns it from the recording."

@@ -1,5 +1,5 @@
 """Poses and depths in other conventions come out as those of the same recording in this package's, and an
-origin far away is moved, in every folder format and for poses of a file."""
+origin far away is moved, in every format and for poses of a file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import CAMERA, FORMATS, Content, quaternion_of, stamped_line
+from every_format import EVERY
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.conventions import conventions_of
@@ -57,12 +58,12 @@ def moved(T: Pose, by_m: np.ndarray) -> Pose:
 
 
 @pytest.mark.parametrize("kind", WRITTEN)
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EVERY)
 def test_poses_come_out_as_of_the_camera(name: str, kind: str, tmp_path: Path) -> None:
     content, (written, flags) = Content(), WRITTEN[kind]
     expected = [T.copy() for T in content.poses]
     content.poses = [written(T) for T in content.poses]
-    dataset = open_dataset(FORMATS[name][0](tmp_path / "recording", content), camera=CAMERA, **flags)
+    dataset = open_dataset(EVERY[name](tmp_path / "recording", content), **flags)
     assert np.allclose([dataset.pose(i) for i in range(5)], expected, atol=1e-6)
     assert np.array_equal(
         [dataset.read(i).T_world_camera for i in range(5)], [dataset.pose(i) for i in range(5)]
@@ -70,12 +71,12 @@ def test_poses_come_out_as_of_the_camera(name: str, kind: str, tmp_path: Path) -
     assert any(note.startswith("conventions: --") for note in dataset.notes)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EVERY)
 def test_an_origin_far_away_is_moved(name: str, tmp_path: Path) -> None:
     content = Content()
     expected = [T.copy() for T in content.poses]
     content.poses = [moved(T, ORIGIN) for T in content.poses]
-    dataset = open_dataset(FORMATS[name][0](tmp_path / "recording", content), camera=CAMERA)
+    dataset = open_dataset(EVERY[name](tmp_path / "recording", content))
     assert np.abs(dataset.read(0).T_world_camera[:3, 3]).max() < 1000
     for index, T in enumerate(expected):
         assert np.allclose(moved(dataset.pose(index), dataset.origin_m), moved(T, ORIGIN), atol=1e-6)

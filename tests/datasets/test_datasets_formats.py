@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,18 @@ from datasets_recordings import (
     CAMERA_TXT,
     FORMATS,
     Content,
-    arrays,
     stamped_line,
     write_freiburg,
     write_house,
     write_image,
     write_log,
-    write_npz,
     write_numbered,
     write_redwood,
-    write_replica,
     write_rows,
-    write_scannet,
     write_seven_scenes,
     write_tum,
 )
-from inputs_bags import writing
+from every_format import WHOLE_NUMBERS
 from rtabmap_database import rvl
 
 from taichi_mrf.datasets import Dataset, open_dataset
@@ -129,36 +124,6 @@ def test_camera_files(tmp_path: Path, file: str, text: str, expected: PinholeCam
     assert dataset.camera == expected
     assert not any("assumed the camera" in note for note in dataset.notes)
     assert dataset.read(1).depth_m.shape == (12, 16)
-
-
-def write_steps(folder: Path, content: Content) -> Path:
-    """An .npz of whole numbers."""
-    whole = {"depth_m": np.stack(content.depth), "depth_scale": np.array(1000.0)}
-    return write_npz(folder.with_suffix(".npz"), arrays(content) | whole)
-
-
-def write_bag(packed: bool, folder: Path, content: Content) -> Path:
-    """A ROS 1 bag with the depth images of a recording, as they are or packed."""
-    path = folder.with_suffix(".bag")
-    with writing(path, "ros1") as bag:
-        bag.camera_info("/depth/camera_info", "optical", CAMERA)
-        for i, image in enumerate(content.depth):
-            if packed:
-                bag.compressed_depth("/depth/image/compressedDepth", 1 + 0.1 * i, "optical", image)
-            else:
-                bag.image("/depth/image", 1 + 0.1 * i, "optical", image, "16UC1")
-            bag.pose_stamped("/camera/pose", 1 + 0.1 * i, "map", content.poses[i])
-    return path
-
-
-WHOLE_NUMBERS: dict[str, Callable[[Path, Content], Path]] = {
-    **{name: writer for name, (writer, _, _) in FORMATS.items()},
-    "scannet": write_scannet,
-    "replica": lambda folder, content: write_replica(folder, content, folder.parent / "cam_params.json"),
-    "npz": write_steps,
-    "bag": partial(write_bag, False),
-    "bag, packed": partial(write_bag, True),
-}
 
 
 @pytest.mark.parametrize("name", WHOLE_NUMBERS)

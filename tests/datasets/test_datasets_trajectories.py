@@ -234,3 +234,15 @@ def test_a_line_shorter_than_its_header_and_a_stamp_that_comes_twice_are_named(t
         UserWarning, match=r"1 of 3 poses .* have the stamp of one before, first .* line 3: 1\.0"
     ):
         read_trajectory(write(tmp_path / "b.txt", "1 0 0 0 0 0 0 1", "2 0 0 0 0 0 0 1", "1 9 0 0 0 0 0 1"))
+
+
+def test_of_a_clock_that_starts_again_the_longest_run_is_read(tmp_path: Path) -> None:
+    """Lines that are only out of order are no runs."""
+    lines = [f"{stamp} {i} 0 0 0 0 0 1" for i, stamp in enumerate([*range(5, 12), *range(20)])]
+    path = write(tmp_path / "two.txt", "# two runs", *lines)
+    with pytest.warns(UserWarning, match=r"two\.txt: .*runs from line 2 \(7 poses\), line 9 \(20 poses\)"):
+        keys, poses = valid_poses(read_trajectory(path))
+    assert keys == list(range(20))
+    assert [T[0, 3] for T in poses] == list(range(7, 27))
+    shuffled = np.random.default_rng(0).permutation(lines[7:]).tolist()
+    assert len(read_trajectory(write(tmp_path / "shuffled.txt", *shuffled)).poses) == 20

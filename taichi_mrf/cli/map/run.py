@@ -21,6 +21,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import collected_warnings
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
@@ -28,6 +29,7 @@ from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE
 from taichi_mrf.runs.folder import RunFacts, write_run
+from taichi_mrf.runs.noise import contradicts
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
 
@@ -129,11 +131,16 @@ def _learn_noise(
     resumed run has learnt it."""
     if task.resume and (task.out / CONFIG_FILE).is_file():
         return None
+    learnt = None
     if task.noise.is_learnt:
-        return learn_noise(dataset, settings, progress, request, task.every, task.limit)
-    if not task.noise.is_checked or task.poses.follow:
-        return None
-    return sigma_of_glance(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
+        learnt = learn_noise(dataset, settings, progress, request, task.every, task.limit)
+    elif task.noise.is_checked and not task.poses.follow:
+        learnt = sigma_of_glance(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
+    # No noise is learnt from a recording that is not what it is taken for. The check of the map says so, too.
+    found = mistakes(dataset) if contradicts(learnt) else []
+    if found and not settings.evaluation.hold_out:
+        dataset.notes.append(f"frames contradict each other: {'; '.join(found)}")
+    return None if found else learnt
 
 
 def listener_of(progress: ProgressBar) -> Listener:

@@ -50,8 +50,8 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
         pose = poses.poses[number]
-        read = partial(_read, file, pose, T_camera_lidar)
-        scans.append(RecordedScan(file.stem, stamp, read, str(file), pose.source))
+        at, read = partial(_pose, pose, T_camera_lidar), partial(_points, file)
+        scans.append(RecordedScan(file.stem, stamp, at, pose.source, read, str(file)))
     dropped = len(files) - len(scans)
     if not scans:
         raise DatasetError(f"{poses.path}: has a pose for none of the {len(files)} scans in {folder / SCANS}")
@@ -99,6 +99,10 @@ def _poses(folder: Path) -> Trajectory:
     return trajectory
 
 
-def _read(file: Path, pose: RecordedPose, T_camera_lidar: Pose) -> tuple[NDArray[np.float64], Pose]:
-    T_world_lidar = inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
-    return read_cloud(file), T_world_lidar
+def _pose(pose: RecordedPose, T_camera_lidar: Pose) -> Pose:
+    """T_world_lidar."""
+    return inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
+
+
+def _points(file: Path, T_world_lidar: Pose) -> NDArray[np.float64]:
+    return read_cloud(file)

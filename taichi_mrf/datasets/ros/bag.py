@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.base import Dataset, Table, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
@@ -26,7 +26,7 @@ from taichi_mrf.datasets.ros.imu import BagImu, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import PoseChoice
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
@@ -36,7 +36,7 @@ from taichi_mrf.datasets.ros.topics import (
     described,
     packed_otherwise,
 )
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -77,16 +77,12 @@ class BagOptions(PoseChoice):
 
 
 @dataclass
-class RosBag(Dataset):
-    """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are.
-    ``cameras`` took them; ``camera`` is the first."""
+class RosBag(Table[BagRow]):
+    """The depth images of one topic, each with its pose. ``cameras`` took them; ``camera`` is the first."""
 
     camera: PinholeCamera
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
-    entries: Sequence[Entry] = field(kw_only=True)
-    poses: Sequence[Pose] = field(kw_only=True)
-    names: Sequence[str] = field(kw_only=True)
     cameras: BagCameras = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
@@ -109,52 +105,26 @@ class RosBag(Dataset):
         """Whether there are images of confidence."""
         return self.confidence is not None
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The number that each image has in its topic, or the run that is read, from 0."""
-        return self.names
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [entry.stamp for entry in self.entries]
-
-    def pose(self, index: int) -> Pose:
-        """The pose of one frame."""
-        return self.poses[index]
-
-    def read(self, index: int) -> Frame:
-        """Decode one image.
-
-        Raises FrameError, which names frame, file and topic, if it is damaged, of another encoding, or of
-        another size than the camera's. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.entries):
-            raise IndexError(f"{self.name} has {len(self.entries)} frames, there is no frame {index}")
-        name, where = self.names[index], f"{self.reader.path}: topic {self.topic}"
-        try:
-            message = self.reader.read(self.topic, self.entries[index])
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
+    def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
+        """Decode one image, which must have its camera's size."""
+        where = f"{self.reader.path}: topic {self.topic}"
+        message = self.reader.read(self.topic, row.entry)
         try:
             depth_m = messages.depth_image(message, self.depth_scale)
         except DatasetError as error:
-            raise FrameError(f"frame {name}: {where}: {error}") from error
-        stamp = self.entries[index].stamp
-        camera = self.cameras.at(self.entries[index], depth_m.shape)
+            raise DatasetError(f"{where}: {error}") from error
+        camera = self.cameras.at(row.entry, depth_m.shape)
         if depth_m.shape != camera.shape:
-            raise FrameError(
-                f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
+            raise DatasetError(
+                f"{where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
                 f"the camera {camera.width} x {camera.height}"
             )
         color = sigma_m = None
-        try:
-            if self.colors is not None:
-                color = self.colors.read(index, depth_m, camera)
-            if self.confidence is not None:
-                sigma_m = self.confidence.read(index, depth_m, camera)
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
-        parts = (self.poses[index], camera, stamp, name, color, sigma_m)
+        if self.colors is not None:
+            color = self.colors.read(index, depth_m, camera)
+        if self.confidence is not None:
+            sigma_m = self.confidence.read(index, depth_m, camera)
+        parts = (T_world_camera, camera, row.stamp, row.name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
@@ -209,10 +179,9 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     confidence, said = find_confidence(reader, chosen.confidence, *parts)
     notes += said + cameras.notes
     tracked, imu = chosen.poses == TRACK, BagImu()
-    poses = [pose for _, _, pose in posed]
     if tracked:
         imu = find_imu(reader, chosen.imu, sensor, stamps[0])
-        poses = [start_pose(imu.up)] * len(posed)
+        posed = [(i, entry, start_pose(imu.up)) for i, entry, _ in posed]
         notes += imu.notes
     return RosBag(
         name=reader.path.stem,
@@ -223,9 +192,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         distortion=cameras.distortion,
         reader=reader,
         topic=depth.name,
-        entries=[entry for _, entry, _ in posed],
-        poses=poses,
-        names=[f"{i:06d}" for i, _, _ in posed],
+        rows=_rows(reader, posed),
         depth_scale=options.depth_scale,
         tracked=tracked,
         colors=colors,
@@ -256,15 +223,18 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
         dropped=len(sensor.entries) - len(posed),
         reader=reader,
         topic=topic,
-        entries=[entry for _, entry, _ in posed],
-        poses=[pose for _, _, pose in posed],
-        names=[f"{i:06d}" for i, _, _ in posed],
+        rows=_rows(reader, posed),
         at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
         registered=registered,
         tracked=tracked,
     )
     bag.look_at_first()
     return bag
+
+
+def _rows(reader: RosReader, posed: Sequence[tuple[int, Entry, Pose]]) -> list[BagRow]:
+    """Frames are named by the number of their message in its topic, or in the run that is read, from 0."""
+    return [BagRow(f"{i:06d}", entry.stamp, pose, f"{reader.path}", entry) for i, entry, pose in posed]
 
 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:

@@ -16,6 +16,7 @@ from taichi_mrf.datasets.stereo.confidence import disparity_sigma
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoRig, stereo_depth
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import read_text
@@ -68,6 +69,14 @@ class StereoPairs(Dataset):
         """When each frame was taken, in seconds."""
         return [pair.stamp for pair in self.pairs]
 
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame. Raises FrameError, which names the frame and the file."""
+        pair = self.pairs[index]
+        try:
+            return pair.pose.T_world_camera()
+        except KeyframeError as error:
+            raise FrameError(f"frame {pair.left_file.stem}: {pair.pose.source}: {error}") from error
+
     def read(self, index: int) -> Frame:
         """Read and match one pair.
 
@@ -78,11 +87,9 @@ class StereoPairs(Dataset):
             raise IndexError(f"{self.name} has {len(self.pairs)} frames, there is no frame {index}")
         pair = self.pairs[index]
         name = pair.left_file.stem
+        T_world_camera = self.pose(index)
         try:
-            T_world_camera = pair.pose.T_world_camera()
             left, right = (read_color(path, self.camera) for path in (pair.left_file, pair.right_file))
-        except KeyframeError as error:
-            raise FrameError(f"frame {name}: {pair.pose.source}: {error}") from error
         except DatasetError as error:
             raise FrameError(f"frame {name}: {error}") from error
         grey_left, grey_right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))

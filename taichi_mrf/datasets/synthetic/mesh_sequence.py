@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.intrinsics import PRIMESENSE
-from taichi_mrf.datasets.options import ReadOptions, parse_options
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
 from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError

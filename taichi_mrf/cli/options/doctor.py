@@ -1,0 +1,39 @@
+"""The options of ``taichi-mrf doctor``."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.schema import Arch
+from taichi_mrf.datasets.source_flags import SourceFlags
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Find out whether a recording is read as it was written, and which flag mends it if not.
+
+    The depths of some twenty frames are compared with each other: as they are read, and with the usual
+    mistakes of poses, stamps, units and intrinsics undone. The exit status is 0 if nothing is odd, 4 if there
+    is something to mend. Example: taichi-mrf doctor recording/ --picture overlap.png
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A recording, as map takes it."""
+
+    poses: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """Poses of SOURCE's frames, in place of its own, as map takes them."""
+
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write a picture (.png) of two frames on top of each other, as read on the left and mended on the right:
+    green where they agree, red where points of the one lie in front of what the other saw, blue behind."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was found as JSON."""
+
+    arch: Arch = "auto"
+    """Backend that renders a built-in source."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""

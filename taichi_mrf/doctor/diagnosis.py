@@ -1,0 +1,174 @@
+"""What is odd of a recording, in words and in the flags that mend it."""
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
+from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.mended import Mended
+from taichi_mrf.datasets.stereo.pairs import StereoPairs
+from taichi_mrf.doctor.readings import UNITS, Reading
+from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
+from taichi_mrf.doctor.views import Sample, read_sample
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+
+_AXES_WORDS = {
+    "": "the optical ones: x right, y down, z ahead",
+    "opengl": "OpenGL's: x right, y up, z back",
+    "ros": "a robot's: x ahead, y left, z up",
+}
+_NO_READING = (
+    "how it is written: the frames that were looked at see different things, or contradict each other in a "
+    "way that none of the usual mistakes explains"
+)
+_CONTRADICTING = 2 * EXPLAINED
+_MOST_EXPLAINED = 0.5
+_FEW_MATCHED, _MORE_MATCHED = 0.25, 2.0
+_WHOLE_STEP = 0.02
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something odd, and the flag that mends it; empty if none does."""
+
+    text: str
+    flag: str = ""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """``findings`` are what is odd, ``undecided`` what the recording cannot tell. ``before`` and ``after``
+    say by how much frames that see the same differ, as a share of depth, as they were read and with the
+    ``reading`` that explains them; None where that is not known."""
+
+    findings: tuple[Finding, ...]
+    undecided: tuple[str, ...] = ()
+    reading: Reading = field(default_factory=Reading)
+    before: float | None = None
+    after: float | None = None
+    search: Search | None = None
+
+
+def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
+    """Look at some twenty frames, and at the poses around them. ``said`` are conventions that are said of the
+    recording and have not been undone in the dataset.
+
+    Raises DatasetError if the source cannot be read, has no end, or no poses of its own.
+    """
+    if dataset.endless or dataset.tracked:
+        what = "never ends" if dataset.endless else "has no poses that are recorded"
+        raise DatasetError(
+            f"{dataset.name}: {what}; doctor compares the frames of a recording by their poses"
+        )
+    if isinstance(dataset, Mended):
+        said = said if dataset.conventions == AS_USUAL else dataset.conventions
+        dataset = dataset.source
+    given = Reading(**asdict(said))
+    source: Dataset = dataset
+    while isinstance(source, Derived):
+        source = source.source
+    swapped = _swapped_images(source)
+    if swapped is not None:
+        return Diagnosis((swapped,), reading=given)
+    sample = read_sample(dataset)
+    steps = getattr(source, "steps_per_metre", None) or _steps(sample)
+    search = Search(sample, given, steps)
+    best = search.best()
+    before = search.score(given)
+    if best == given and before > _CONTRADICTING:
+        return Diagnosis((), (_NO_READING,), given)
+    undecided = tuple(search.undecided(best))
+    answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
+    if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
+        return Diagnosis((), (_NO_READING,), given)
+    found = tuple(_findings(given, best, steps, source))
+    return Diagnosis(found, undecided, best, before, search.score(best), search)
+
+
+def mistakes(dataset: Dataset) -> list[str]:
+    """The findings in words: none for a source that cannot be looked at."""
+    try:
+        found = diagnose(dataset).findings
+    except DatasetError:
+        return []
+    return [f"{each.text} ({each.flag} mends it)" if each.flag else each.text for each in found]
+
+
+def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
+    """The same, and soon, before anything is mapped: none if most of the frames that can be read in so many
+    seconds explain each other, or if they are too few to tell."""
+    if dataset.endless or dataset.tracked:
+        return []
+    try:
+        search = Search(read_sample(dataset, seconds), Reading(), 1.0)
+    except DatasetError:
+        return []
+    off = search.differences(Reading())
+    if len(off) < FEWEST_PAIRS or (off <= EXPLAINED).mean() >= _MOST_EXPLAINED:
+        return []
+    return mistakes(dataset)
+
+
+def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:
+    """What the best reading has other than the given one. Each finding of poses has the flag of them all."""
+    poses = next((flag for flag in best.flags() if flag.startswith("--poses-are")), "--poses-are ''")
+    found = []
+    if best.w_first != given.w_first:
+        found.append(Finding(f"quaternions have w {'first' if best.w_first else 'last'}", poses))
+    if best.inverse != given.inverse:
+        found.append(Finding(f"poses are {'T_camera_world' if best.inverse else 'T_world_camera'}", poses))
+    if best.axes != given.axes:
+        found.append(Finding(f"poses are of a frame whose axes are {_AXES_WORDS[best.axes]}", poses))
+    if best.late_s != given.late_s:
+        late = "late" if best.late_s >= 0 else "early"
+        found.append(Finding(f"the stamps of the poses are {abs(best.late_s):.2f} s {late}", poses))
+    if best.along_ray != given.along_ray:
+        along, word = ("ray", RANGE) if best.along_ray else ("optical axis", AXIAL)
+        found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
+    if best.factor != given.factor:
+        right = steps / best.factor
+        unit = next(name for each, name in UNITS.items() if math.isclose(each, right))
+        text = f"depth has {right:.6g} steps per metre ({unit}), not {steps:.6g}"
+        found.append(Finding(text, f"--depth-scale {right:.6g}"))
+    if best.lens and isinstance(source.camera, PinholeCamera):
+        k = best.camera_of(source.camera)
+        flag = f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
+        found.append(Finding(f"the intrinsics {best.lens}", flag))
+    return found
+
+
+def _steps(sample: Sample) -> float:
+    """The steps per metre that depths are whole numbers of; 1 for depths between steps."""
+    depths = [view.points[:, 2] for view in sample.views.values() if isinstance(view.camera, PinholeCamera)]
+    values = np.concatenate(depths) if depths else np.empty(0)
+    for steps in sorted(UNITS):
+        if values.size and np.abs(values * steps - np.rint(values * steps)).max() < _WHOLE_STEP:
+            return steps
+    return 1.0
+
+
+def _swapped_images(source: Dataset) -> Finding | None:
+    """Whether far more of a stereo recording's pixels are matched with the left and right images swapped."""
+    if not isinstance(source, StereoPairs) or not len(source):
+        return None
+    swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.pairs]
+    given = _matched(source)
+    if given > _FEW_MATCHED:
+        return None
+    other = _matched(replace(source, pairs=swapped))
+    if other < _MORE_MATCHED * given:
+        return None
+    return Finding(
+        f"the left and right images are swapped: {given:.0%} of the pixels are matched, {other:.0%} the "
+        "other way round; exchange them"
+    )
+
+
+def _matched(pairs: StereoPairs) -> float:
+    """The share of pixels with a depth, of the first frame, the last and one between."""
+    indices = {0, len(pairs) // 2, len(pairs) - 1}
+    return float(np.mean([(pairs.read(index).depth_m > 0).mean() for index in indices]))

@@ -1,0 +1,220 @@
+"""The search for the reading of a recording with which its frames explain each other best."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.conventions import AXES
+from taichi_mrf.datasets.mended import pose_of
+from taichi_mrf.datasets.overlap import SeenAgain, seen_again
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
+from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.sensor.camera import PinholeCamera
+
+EXPLAINED = 0.03
+"""Frames whose depths differ by less, as a share of depth, explain each other."""
+
+FEWEST_PAIRS = 3
+"""Fewer pairs of frames do not tell a reading from another."""
+
+QUESTIONS = {
+    "inverse": "the direction of poses",
+    "w_first": "the order of quaternions",
+    "axes": "the axes of the camera",
+    "factor": "the unit of depth",
+    "along_ray": "depth along the ray or the axis",
+    "lens": "the size of the intrinsics' images",
+    "late_s": "the time of poses",
+}
+"""What each field of a reading answers."""
+
+_WORST = 0.2
+_EXPLAINING = 0.5
+_NOISE = 0.002
+_BETTER, _AS_WELL = 2.0, 1.3
+_ROUNDS = 3
+_FEW, _MANY = 2, 8
+_LATE_STEPS_S = (0.05, 0.01)
+
+Options = Callable[[Reading], list[Reading]]
+
+
+class Search:
+    """Tries readings on the pairs of a sample, whose frames were read as ``given``.
+
+    A pair's difference is the mean of |expected - measured|, as a share of the larger of the two, over the
+    half of a frame's points that fit best, seen from the one or the other frame, whichever fits better. A
+    point that is not seen again counts as one that does not fit at all. So what lies behind something else
+    does no harm, nor does what a camera leaves behind as it moves ahead, and a reading with which frames see
+    nothing of each other wins nothing.
+    """
+
+    def __init__(self, sample: Sample, given: Reading, steps_per_metre: float) -> None:
+        """``steps_per_metre`` is the unit of the depth images as they are read."""
+        self.sample, self.given = sample, given
+        self._units = [steps_per_metre / steps for steps in UNITS if not np.isclose(steps, steps_per_metre)]
+        self._known: dict[Reading, Floats] = {}
+        self._mended: dict[Reading, Floats] = {}
+        self._least = np.full(len(sample.pairs), _WORST)
+        self._place = {int(frame): place for place, frame in enumerate(sample.frames)}
+        cameras = [view.camera for view in sample.views.values() if isinstance(view.camera, PinholeCamera)]
+        of_lenses = {LENSES[lens](camera): lens for camera in cameras[:1] for lens in reversed(LENSES)}
+        self._lenses = [lens for camera, lens in of_lenses.items() if camera != cameras[0]]
+        gaps = np.diff(sample.stamps)
+        self._has_stamps = len(gaps) > 0 and bool((gaps > 0).all())
+        self._gap = 3 * float(np.median(gaps)) if len(gaps) else 0.0
+
+    def differences(self, reading: Reading) -> Floats:
+        """By how much the frames of each pair differ, 0 to 0.2; NaN where a pose is not known at the time."""
+        if reading not in self._known:
+            found = np.fromiter(self._differences(reading), np.float64)
+            self._known[reading], self._least = found, np.fmin(self._least, found)
+        return self._known[reading]
+
+    def moves(self, reading: Reading) -> Iterator[Pose | None]:
+        """T_second_first of each pair, None where a pose is not known at the time."""
+        of_poses = replace(reading, late_s=0.0, along_ray=False, factor=1.0, lens="")
+        if of_poses not in self._mended:
+            mended = [pose_of(T, of_poses) for T in self.sample.poses]
+            self._mended[of_poses] = np.array(mended).reshape(-1, 4, 4)
+        poses, known = self._mended[of_poses], np.ones(len(self.sample.poses), dtype=bool)
+        if reading.late_s:
+            stamps = self.sample.stamps
+            poses, known = TimedPoses(stamps, poses).between(stamps + reading.late_s, self._gap)
+        for first, second in self.sample.pairs:
+            a, b = self._place[first], self._place[second]
+            yield inverse(poses[b]) @ poses[a] if known[a] and known[b] else None
+
+    def _differences(self, reading: Reading) -> Iterator[float]:
+        views = self.sample.views
+        points = {frame: points_of(view, reading) for frame, view in views.items()}
+        for (first, second), T in zip(self.sample.pairs, self.moves(reading), strict=True):
+            if T is None:
+                yield float("nan")
+            else:
+                there = _difference(points[first], T, views[second], reading)
+                yield min(there, _difference(points[second], inverse(T), views[first], reading))
+
+    def usable(self) -> NDArray[np.bool_]:
+        """The pairs that something that was tried explains: the others see different things."""
+        return self._least <= EXPLAINED
+
+    def score(self, reading: Reading) -> float:
+        """The mean difference over the usable pairs. If too few of them tell, one more than over all."""
+        found, usable = self.differences(reading), self.usable()
+        told = usable & ~np.isnan(found)
+        if told.sum() < max(FEWEST_PAIRS, usable.sum() / 3):
+            return 1 + float(np.nan_to_num(found, nan=1.0).mean()) if len(found) else 2.0
+        # Of late poses some pairs are not known. What they lack is made up for, so that scores compare.
+        whole = self.differences(replace(reading, late_s=0.0)) + _NOISE
+        return float(found[told].mean() * whole[usable].mean() / whole[told].mean())
+
+    def clearly_better(self, one: Reading, other: Reading) -> bool:
+        """Whether frames explain each other with the one, and differ by more than twice as much with the
+        other."""
+        best = self.score(one)
+        return best <= EXPLAINED and _BETTER * (best + _NOISE) < self.score(other) + _NOISE
+
+    def best(self) -> Reading:
+        """The reading that explains the frames and differs least from the given one, which stays unless
+        another is clearly better."""
+        kept, before = [self.given], None
+        # Of two mistakes the one is sought in the presence of the other, so what is found is sought again.
+        for _ in range(_ROUNDS):
+            kept = self._best(self._best(kept, self._of_poses_and_unit, _FEW), self._of_camera, _MANY)
+            if kept[0] == before or self.score(self.given) <= min(EXPLAINED, self.score(kept[0])):
+                break
+            before = kept[0]
+        if self._has_stamps:
+            for step in _LATE_STEPS_S:
+                kept = self._best(kept, partial(self._of_time, step=step), _FEW)
+        best = kept[0]
+        for field in fields(Reading):
+            simpler = replace(best, **{field.name: getattr(self.given, field.name)})
+            if not self.clearly_better(best, simpler):
+                best = simpler
+        return best if self.clearly_better(best, self.given) else self.given
+
+    def undecided(self, best: Reading) -> list[str]:
+        """The assumptions whose contrary explains the frames nearly as well as the best reading does."""
+        others = {
+            QUESTIONS["inverse"]: [replace(best, inverse=not best.inverse)],
+            QUESTIONS["w_first"]: [replace(best, w_first=not best.w_first)],
+            QUESTIONS["axes"]: [replace(best, axes=a) for a in ("", *AXES) if a != best.axes],
+            QUESTIONS["factor"]: [replace(best, factor=best.factor * times) for times in (0.2, 5.0, 1000.0)],
+            QUESTIONS["along_ray"]: [replace(best, along_ray=not best.along_ray)],
+            QUESTIONS["lens"]: [replace(best, lens=a) for a in [*LENSES][:2] if a != best.lens],
+        }
+        if not self._lenses:
+            others = dict([*others.items()][:-2])
+        late = [replace(best, late_s=best.late_s + late) for late in (-0.3, 0.3)] if self._has_stamps else []
+        for each in (other for tried in [*others.values(), late] for other in tried):
+            self.differences(each)
+        limit = _AS_WELL * (self.score(best) + _NOISE) - _NOISE
+        found = [name for name, tried in others.items() if min(map(self.score, tried)) < limit]
+        times = [score for score in map(self.score, late) if score < 1]
+        return found if times and min(times) >= limit else [*found, QUESTIONS["late_s"]]
+
+    def _best(self, kept: Sequence[Reading], options: Options, count: int) -> list[Reading]:
+        """Those kept, and what options make of the first ``count`` and of the given one; the best first."""
+        taken = dict.fromkeys([*kept[:count], self.given])
+        tried = dict.fromkeys(each for reading in taken for each in [reading, *options(reading)])
+        for reading in tried:
+            self.differences(reading)
+        return sorted(dict.fromkeys([*kept, *tried]), key=self.score)
+
+    def _of_poses_and_unit(self, reading: Reading) -> list[Reading]:
+        ways = product((False, True), (False, True), ("", *AXES), (1.0, *self._units))
+        return [replace(reading, w_first=w, inverse=i, axes=a, factor=f) for w, i, a, f in ways]
+
+    def _of_camera(self, reading: Reading) -> list[Reading]:
+        if not self._lenses:
+            return []
+        ways = product((False, True), ("", *self._lenses))
+        return [replace(reading, along_ray=ray, lens=lens) for ray, lens in ways]
+
+    def _of_time(self, reading: Reading, step: float) -> list[Reading]:
+        """Poses that are late or early: by up to a second at the first step, then by something near."""
+        count = round((REACH_S if step == _LATE_STEPS_S[0] else _LATE_STEPS_S[0]) / step)
+        return [
+            replace(reading, late_s=round(reading.late_s + i * step, 4)) for i in range(-count, count + 1)
+        ]
+
+
+def points_of(view: View, reading: Reading) -> Floats:
+    """The points (N, 3) of a view in the camera frame."""
+    camera = view.camera
+    if not isinstance(camera, PinholeCamera):
+        return view.points * reading.factor
+    rays = reading.camera_of(camera).directions(view.u, view.v)
+    if reading.along_ray:
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays * (view.points[:, 2:] * reading.factor)
+
+
+def seen_by(view: View, points: Floats, T_second_first: Pose, reading: Reading) -> SeenAgain:
+    """The points (N, 3) of another view in this one."""
+    camera = view.camera
+    if isinstance(camera, PinholeCamera):
+        camera = reading.camera_of(camera)
+    seen = seen_again(points, T_second_first, view.image, camera)
+    if reading.along_ray and isinstance(camera, PinholeCamera):
+        ranges = np.linalg.norm(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], axis=1)
+        seen = replace(seen, expected=ranges)
+    return replace(seen, measured=seen.measured * reading.factor)
+
+
+def _difference(points: Floats, T_second_first: Pose, view: View, reading: Reading) -> float:
+    seen = seen_by(view, points, T_second_first, reading)
+    both = seen.measured > 0
+    expected, measured = seen.expected[both], seen.measured[both]
+    off = np.full(len(points), _WORST)
+    off[both] = np.minimum(np.abs(expected - measured) / np.maximum(expected, measured), _WORST)
+    count = max(1, int(_EXPLAINING * len(off)))
+    return float(np.partition(off, count - 1)[:count].mean())

@@ -1,0 +1,214 @@
+"""The usual mistakes of conventions are found, and nothing in what is as it should be."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from broken_recordings import BREAKS, FLAGS, LATE_S, of_frames
+from console import carry_out
+from datasets_recordings import stamped_line, write_image
+from kitti_street import write_kitti
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.datasets.synthetic.analytic_render import render
+from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes_at_a_glance
+from taichi_mrf.doctor.picture import overlap
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.live.source import open_source
+from taichi_mrf.sensor.frame import Frame
+
+SHARED = {
+    "seven_scenes_redkitchen": 100,
+    "icl_nuim_livingroom_traj2": 10,
+    "house_livingroom": 40,
+    "coffin_world": 12,
+    "stereo_kitti/KITTI_sequence_1": 51,
+    "lidar_building": 59,
+    "la3dm_structured": 12,
+}
+
+
+@pytest.fixture
+def room(one_backend: None) -> list[Frame]:
+    return rendered()
+
+
+@cache
+def rendered() -> list[Frame]:
+    dataset = open_dataset("synthetic:room?frames=40&width=160&height=120", color=False)
+    return [dataset.read(i) for i in range(len(dataset))]
+
+
+@cache
+def kitchen(folder: Path) -> list[Frame]:
+    dataset = open_dataset(folder / "seven_scenes_redkitchen", color=False)
+    return [dataset.read(i) for i in range(len(dataset))]
+
+
+def broken(frames: Sequence[Frame], *names: str) -> Sequence[Frame]:
+    for name in names:
+        frames = BREAKS[name](frames)
+    return frames
+
+
+def assert_named(found: Diagnosis, name: str, frames: Sequence[Frame]) -> None:
+    (finding,) = found.findings
+    assert finding.flag.startswith(FLAGS[name])
+    if name == "intrinsics":
+        k, read = frames[0].camera, [float(word) for word in finding.flag.split()[1].split(",")]
+        np.testing.assert_allclose(read, (k.fx, k.fy, k.cx, k.cy), rtol=1e-5)
+    elif name == "late":
+        # Between frames poses are interpolated, which tells the time to a tenth of their distance.
+        apart = frames[1].stamp - frames[0].stamp
+        assert abs(float(finding.flag.split("=")[1]) - LATE_S) <= 0.1 * apart
+    else:
+        assert finding.flag == FLAGS[name]
+
+
+@pytest.mark.parametrize("name", BREAKS)
+def test_the_mistake_in_a_broken_room_is_named(room: list[Frame], name: str) -> None:
+    assert_named(diagnose(of_frames(broken(room, name))), name, room)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", BREAKS)
+def test_the_mistake_in_a_broken_kitchen_is_named(shared_data: Path, name: str) -> None:
+    frames = kitchen(shared_data)
+    assert_named(diagnose(of_frames(broken(frames, name))), name, frames)
+
+
+@pytest.mark.parametrize(
+    ("names", "flags"),
+    [
+        (("opengl", "inverse"), {"--poses-are inverse,opengl"}),
+        (("ros", "wxyz"), {"--poses-are wxyz,ros"}),
+        (("inverse", "range", "unit"), {"--poses-are inverse", "--depth-scale 1000", "--depth-is range"}),
+    ],
+)
+def test_mistakes_that_come_together_are_told_apart(
+    room: list[Frame], names: tuple[str, ...], flags: set[str]
+) -> None:
+    assert {each.flag for each in diagnose(of_frames(broken(room, *names))).findings} == flags
+
+
+def test_nothing_is_found_in_the_room_as_it_is(room: list[Frame]) -> None:
+    found = diagnose(of_frames(room))
+    assert (found.findings, found.undecided) == ((), ())
+    assert found.before == found.after
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("name", SHARED)
+def test_nothing_is_found_in_real_recordings(shared_data: Path, name: str) -> None:
+    dataset = open_dataset(shared_data / name, color=False)
+    assert len(dataset) == SHARED[name]
+    assert diagnose(dataset).findings == ()
+
+
+def test_a_camera_that_turns_in_place_does_not_tell_the_unit(room: list[Frame]) -> None:
+    scene = open_dataset("synthetic:room?frames=40", color=False).scene  # type: ignore[attr-defined]
+    camera, frames = room[0].camera, []
+    for i in range(30):
+        angle = 0.06 * i
+        T = look_at((0, 0, 0), (np.cos(angle), np.sin(angle), 0.3 * np.sin(3 * angle)))
+        frames.append(Frame(render(scene, camera, T, False)[0], T, camera, i / 10, f"{i}"))
+    found = diagnose(of_frames(frames))
+    assert found.findings == ()
+    assert "the unit of depth" in found.undecided
+    assert "the direction of poses" not in found.undecided
+    still = diagnose(of_frames([replace(room[0], stamp=i / 10) for i in range(30)]))
+    assert still.findings == ()
+    assert {"the unit of depth", "the direction of poses", "the time of poses"} <= set(still.undecided)
+
+
+def test_frames_that_see_different_things_tell_nothing(room: list[Frame]) -> None:
+    apart = diagnose(of_frames([room[0], replace(room[20], name="other")]))
+    assert apart.findings == ()
+    assert len(apart.undecided) == 1
+    assert apart.undecided[0].startswith("how it is written")
+    assert overlap(apart) is None
+
+
+def test_what_has_no_poses_is_refused(room: list[Frame]) -> None:
+    dataset = of_frames(room)
+    dataset.tracked = True
+    with pytest.raises(DatasetError, match="no poses that are recorded"):
+        diagnose(dataset)
+
+
+def test_swapped_images_of_a_stereo_rig_are_found(tmp_path: Path) -> None:
+    street = write_kitti(tmp_path / "street")
+    assert diagnose(open_dataset(street)).findings == ()
+    left, right, aside = (street / name for name in ("image_l", "image_r", "aside"))
+    left.rename(aside)
+    right.rename(left)
+    aside.rename(right)
+    (finding,) = diagnose(open_dataset(street)).findings
+    assert finding.text.startswith("the left and right images are swapped")
+
+
+def write_tum(folder: Path, frames: Sequence[Frame]) -> Path:
+    """Millimetres, as many write them in this layout, whose unit is another."""
+    for frame in frames:
+        write_image(folder / f"depth/{frame.stamp:.2f}.png", np.rint(1000 * frame.depth_m).astype(np.uint16))
+    k = frames[0].camera
+    (folder / "camera.txt").write_text(f"{k.width} {k.height} {k.fx} {k.fy} {k.cx} {k.cy}")
+    (folder / "depth.txt").write_text("\n".join(f"{f.stamp:.2f} depth/{f.stamp:.2f}.png" for f in frames))
+    lines = [stamped_line(f.stamp, f.T_world_camera) for f in frames]
+    (folder / "groundtruth.txt").write_text("\n".join(lines))
+    return folder
+
+
+def test_the_flags_that_are_named_mend_a_recording(
+    room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_tum(tmp_path / "mine", broken(room, "opengl", "inverse"))
+    picture = tmp_path / "overlap.png"
+    assert carry_out("doctor", folder, "--picture", picture) == 4
+    out = capsys.readouterr().out
+    flags = ("--poses-are", "inverse,opengl", "--depth-scale", "1000")
+    assert f"taichi-mrf map {folder} {' '.join(flags)} --out DIR" in out
+    green = np.count_nonzero((cv2.imread(str(picture)) == (80, 200, 60)).all(axis=-1), axis=0)
+    width = room[0].camera.width
+    assert green[:width].sum() < 0.2 * green[width:].sum()
+    assert carry_out("doctor", folder, *flags) == 0
+    assert capsys.readouterr().out.startswith("Nothing odd was found.")
+    # What was said of it and is not so is a mistake too.
+    wrong = ("--poses-are", "inverse,opengl,wxyz", "--depth-scale", "1000")
+    assert carry_out("doctor", folder, *wrong, "--json") == 4
+    facts = json.loads(capsys.readouterr().out)
+    assert [each["flag"] for each in facts["findings"]] == ["--poses-are inverse,opengl"]
+    assert facts["difference_mended"] < facts["difference"] / 2
+
+
+@pytest.mark.parametrize("noise", ["checked", "auto"])
+def test_map_names_the_mistake_and_learns_no_noise_from_it(
+    room: list[Frame], noise: str, tmp_path: Path
+) -> None:
+    folder = write_tum(tmp_path / "mine", broken(room, "inverse"))
+    out = tmp_path / "out"
+    coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--noise", noise, "--quiet")
+    assert carry_out("map", folder, "--out", out, *coarse) == 0
+    report = json.loads((out / "report.json").read_text())
+    (note,) = [note for note in report["notes"] if "contradict" in note]
+    assert note.endswith("poses are T_camera_world (--poses-are inverse mends it).")
+    assert report["noise"]["learnt"] is None
+    assert "--noise auto" not in " ".join(report["notes"])
+
+
+def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp_path: Path) -> None:
+    assert mistakes_at_a_glance(of_frames(room)) == []
+    folder = write_tum(tmp_path / "mine", broken(room, "opengl"))
+    reading = SourceFlags(depth_scale=1000)
+    _, notes = open_source(str(folder), Config(), every=1, limit=None, speed=1.0, loop=False, reading=reading)
+    (note,) = [note for note in notes if "contradict" in note]
+    assert "OpenGL" in note
+    assert note.endswith("(--poses-are opengl mends it)")

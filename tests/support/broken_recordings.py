@@ -1,0 +1,99 @@
+"""Copies of a recording with one of the usual mistakes of conventions made on purpose."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.timed_poses import TimedPoses, quaternion
+from taichi_mrf.datasets.trajectories import rotation_of
+from taichi_mrf.geometry.poses import inverse
+from taichi_mrf.sensor.frame import Frame
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+ROS_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""T_body_camera: x of the body is ahead, which is z of the camera."""
+
+FLAGS = {
+    "inverse": "--poses-are inverse",
+    "wxyz": "--poses-are wxyz",
+    "opengl": "--poses-are opengl",
+    "ros": "--poses-are ros",
+    "unit": "--depth-scale 1000",
+    "range": "--depth-is range",
+    "late": "--poses-are late=",
+    "intrinsics": "--camera ",
+}
+"""What mends them, or how it begins."""
+
+Break = Callable[[Sequence[Frame]], list[Frame]]
+
+
+def of_poses(change: Callable[[np.ndarray], np.ndarray]) -> Break:
+    return lambda frames: [replace(f, T_world_camera=change(f.T_world_camera)) for f in frames]
+
+
+def _w_first(T: np.ndarray) -> np.ndarray:
+    """What a reader of x y z w makes of w x y z."""
+    x, y, z, w = quaternion(T[:3, :3])
+    read = T.copy()
+    read[:3, :3] = rotation_of(np.array([w, x, y, z]))
+    return read
+
+
+def of_depth(change: Callable[[Frame], np.ndarray]) -> Break:
+    return lambda frames: [replace(f, depth_m=change(f).astype(np.float32)) for f in frames]
+
+
+def late(seconds: float) -> Break:
+    def shift(frames: Sequence[Frame]) -> list[Frame]:
+        stamps = np.array([f.stamp for f in frames])
+        poses, known = TimedPoses(stamps, [f.T_world_camera for f in frames]).between(stamps - seconds, 9.0)
+        kept = [(f, T) for f, T, there in zip(frames, poses, known, strict=True) if there]
+        return [replace(f, T_world_camera=T) for f, T in kept]
+
+    return shift
+
+
+def of_camera(factor: float) -> Break:
+    """Images of 1/factor of the size that the intrinsics are of."""
+
+    def change(frame: Frame) -> Frame:
+        k = frame.camera
+        scaled = {n: getattr(k, n) * factor for n in ("fx", "fy")}
+        centre = {n: (getattr(k, n) + 0.5) * factor - 0.5 for n in ("cx", "cy")}
+        return replace(frame, camera=replace(k, **scaled, **centre))
+
+    return lambda frames: [change(f) for f in frames]
+
+
+LATE_S = 0.3
+BREAKS: dict[str, Break] = {
+    "inverse": of_poses(inverse),
+    "wxyz": of_poses(_w_first),
+    "opengl": of_poses(lambda T: T @ OPENGL),
+    "ros": of_poses(lambda T: T @ inverse(ROS_OPTICAL)),
+    "unit": of_depth(lambda f: np.rint(1000 * f.depth_m) / 5000),  # millimetres, read as TUM RGB-D's
+    "range": of_depth(lambda f: f.depth_m * np.linalg.norm(f.camera.rays(), axis=-1)),
+    "late": late(LATE_S),
+    "intrinsics": of_camera(2.0),
+}
+
+
+@dataclass
+class Frames(Dataset):
+    """Frames that are at hand."""
+
+    frames: Sequence[Frame] = field(default=())
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        return [frame.name for frame in self.frames]
+
+    def read(self, index: int) -> Frame:
+        return self.frames[index]
+
+
+def of_frames(frames: Sequence[Frame]) -> Frames:
+    return Frames("frames", frames[0].camera, frames=frames)
