@@ -155,11 +155,11 @@ def _swapped_images(source: Dataset) -> Finding | None:
     """Whether far more of a stereo recording's pixels are matched with the left and right images swapped."""
     if not isinstance(source, StereoPairs) or not len(source):
         return None
-    swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.pairs]
+    swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.rows]
     given = _matched(source)
     if given > _FEW_MATCHED:
         return None
-    other = _matched(replace(source, pairs=swapped))
+    other = _matched(replace(source, rows=swapped))
     if other < _MORE_MATCHED * given:
         return None
     return Finding(
