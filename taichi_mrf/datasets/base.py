@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, look_at
@@ -187,6 +188,23 @@ class Table(Dataset, Generic[AnyRow]):
     """A recording as a table with a row for each frame. A format fills it, and says how a row is loaded."""
 
     rows: Sequence[AnyRow] = field(kw_only=True)
+    confidence: Confidence | None = field(default=None, kw_only=True)
+    """What the images of confidence mean that come with the frames, None without."""
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """What the confidence is relative to, None without."""
+        return None if self.confidence is None else self.confidence.sigma
+
+    @property
+    def states_pixel_sigma(self) -> bool:
+        """Whether there are images of confidence."""
+        return self.confidence is not None
+
+    @property
+    def sigma_origin(self) -> str:
+        """Where the confidence's comes from."""
+        return super().sigma_origin if self.confidence is None else self.confidence.origin
 
     @abstractmethod
     def load(self, index: int, row: AnyRow, T_world_camera: Pose) -> Frame:

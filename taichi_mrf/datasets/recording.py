@@ -42,8 +42,7 @@ class Recording(Table[RecordedFrame]):
 
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
     ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``color_camera`` took the
-    colour images, unless they are registered to depth. ``confidence`` tells what images of confidence mean,
-    where there are some.
+    colour images, unless they are registered to depth.
     """
 
     camera: PinholeCamera
@@ -52,17 +51,6 @@ class Recording(Table[RecordedFrame]):
     scale_assumed: bool = False
     color: bool = True
     color_camera: ColorCamera | None = None
-    confidence: Confidence | None = None
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return None if self.confidence is None else self.confidence.sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return super().sigma_origin if self.confidence is None else self.confidence.origin
 
     @property
     def states_pixel_sigma(self) -> bool:

@@ -65,21 +65,6 @@ class Record3D(Table[Record3DFrame]):
     steps_per_metre: float = 1.0
     color: bool = True
 
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return ARKIT.sigma if self.states_pixel_sigma else None
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return ARKIT.origin if self.states_pixel_sigma else super().sigma_origin
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether frames have images of confidence."""
-        return any(_file(row.number, "conf") in self.files.names for row in self.rows)
-
     def load(self, index: int, row: Record3DFrame, T_world_camera: Pose) -> Frame:
         """Read depth, confidence and colour, which must have the sizes that they should."""
         number, own = row.number, None if self.cameras is None else self.cameras[index]
@@ -160,6 +145,7 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
         dropped,
         files=files,
         metadata=metadata,
+        confidence=ARKIT if any(_file(number, "conf") in files.names for number in posed) else None,
         rows=[_row(metadata, number, stamp) for number, stamp in zip(posed, stamps, strict=True)],
         cameras=None if overridden else metadata.cameras(posed),
         steps_per_metre=options.depth_scale or 1.0,

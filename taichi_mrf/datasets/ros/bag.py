@@ -86,24 +86,9 @@ class RosBag(Table[BagRow]):
     cameras: BagCameras = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
-    confidence: BagConfidence | None = None
+    confidences: BagConfidence | None = None
     gyro: GyroSamples | None = None
     acceleration: AccelerationSamples | None = None
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return None if self.confidence is None else L515.sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return super().sigma_origin if self.confidence is None else L515.origin
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether there are images of confidence."""
-        return self.confidence is not None
 
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one image, which must have its camera's size."""
@@ -122,8 +107,8 @@ class RosBag(Table[BagRow]):
         color = sigma_m = None
         if self.colors is not None:
             color = self.colors.read(index, depth_m, camera)
-        if self.confidence is not None:
-            sigma_m = self.confidence.read(index, depth_m, camera)
+        if self.confidences is not None:
+            sigma_m = self.confidences.read(index, depth_m, camera)
         parts = (T_world_camera, camera, row.stamp, row.name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
@@ -196,7 +181,8 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         depth_scale=options.depth_scale,
         tracked=tracked,
         colors=colors,
-        confidence=confidence,
+        confidence=None if confidence is None else L515,
+        confidences=confidence,
         gyro=imu.gyro,
         acceleration=imu.acceleration,
     )
