@@ -35,7 +35,6 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-SUFFIXES = (".yaml", ".yml")
 _SOURCE = re.compile(r"[a-z][a-z0-9_]+:")
 
 

@@ -40,7 +40,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_file
 
-SUFFIX, METADATA, IMAGES = ".r3d", "metadata", "rgbd"
+METADATA, IMAGES = "metadata", "rgbd"
 _MOST_METADATA, _MOST_IMAGE = 1 << 27, 1 << 26
 _MOST_DIGITS = 9
 _ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -28,7 +28,6 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.system.files import is_file
 
-SUFFIXES = (".las", ".laz")
 _MOST_SCANS = 1 << 40
 
 

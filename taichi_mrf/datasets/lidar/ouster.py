@@ -28,7 +28,6 @@ from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import check_regular
 from taichi_mrf.system.libraries import library
 
-SUFFIXES = (OSF, ".pcap")
 STANDS_STILL = "contains no poses: the lidar is assumed to stand still; for one that moves add ?poses=FILE"
 _LONGEST_GAP_S = 1.0
 

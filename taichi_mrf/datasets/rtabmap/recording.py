@@ -25,7 +25,6 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
-NAME = "RTAB-Map"
 STEPS_PER_METRE = 1000.0
 
 

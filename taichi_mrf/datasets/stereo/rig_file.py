@@ -34,7 +34,6 @@ from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
-SUFFIXES = (".yaml", ".yml")
 SECONDS_PER_PAIR = 0.1
 _NANOSECOND_DIGITS = 16
 
