@@ -4,9 +4,9 @@ CPU's tests that are marked `compilers` or `smoke` run with that too.
 
     python tests/backends.py [options of pytest]
 
-Some processes run the CPU's tests; each takes the next folder of tests that is not taken yet. All run side by
-side, because tests of pages and processes wait more than they compute. Each one's output is printed in one
-piece: that of the first as it comes, the others' when that is done.
+With --quick the CPU alone has its turn. Some processes run the CPU's tests; each takes the next folder of
+tests that is not taken yet. All run side by side, because tests of pages and processes wait more than they
+compute. Each one's output is printed in one piece: the first's as it comes, the others' when that is done.
 """
 
 import importlib.util
@@ -19,7 +19,7 @@ from typing import IO
 
 from taichi_mrf.system import compiler, runtime
 
-PROCESSES = 3
+PROCESSES, QUICK_PROCESSES = 3, 2
 
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
@@ -34,13 +34,16 @@ def main() -> int:
         # The least priority: `live` and `tune` lower theirs, and would wait for all tests of higher priority.
         os.nice(19)
     first, *others = found
+    quick = "--quick" in sys.argv[1:]
+    processes, others = (QUICK_PROCESSES, []) if quick else (PROCESSES, others)
     with ExitStack() as stack:
         queue = stack.enter_context(tempfile.TemporaryDirectory())
         command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
         share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
-        beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
-        beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
+        beside |= {_name(first, number, processes): share for number in range(2, processes + 1)}
+        if not quick:
+            beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
         runs = []
         for name, its_command in beside.items():
             output = stack.enter_context(tempfile.TemporaryFile())
@@ -52,11 +55,11 @@ def main() -> int:
                 env={**os.environ, compiler.VARIABLE: chosen},
             )
             runs.append((name, process, output))
-        return _finish(_name(first, 1), share, runs)
+        return _finish(_name(first, 1, processes), share, runs)
 
 
-def _name(arch: str, number: int) -> str:
-    return f"{arch}, process {number} of {PROCESSES}"
+def _name(arch: str, number: int, processes: int) -> str:
+    return f"{arch}, process {number} of {processes}"
 
 
 def _other_compilers() -> list[str]:

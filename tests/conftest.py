@@ -47,7 +47,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--quick",
         action="store_true",
-        help="leave out tests that start Taichi or a process, but run the smoke test of each mapping method",
+        help="leave out tests that start Taichi or a process, or read recordings, but for the smoke tests",
     )
 
 
@@ -57,7 +57,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=soak)
         items[:] = [item for item in items if item not in set(soak)]
     if config.getoption("--quick"):
-        left_out = [item for item in items if _uses(item, "backend") and not _is_smoke(item)]
+        left_out = [
+            item for item in items if (_uses(item, "backend") and not _is_smoke(item)) or _is_large(item)
+        ]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
     if config.getoption("--arch") == "cpu":
@@ -126,6 +128,11 @@ def _is_for_every_backend(item: pytest.Item) -> bool:
 
 def _uses(item: pytest.Item, fixture: str) -> bool:
     return fixture in getattr(item, "fixturenames", ())
+
+
+def _is_large(item: pytest.Item) -> bool:
+    """Whether it reads a whole recording."""
+    return item.get_closest_marker("shared_data") is not None
 
 
 def _is_smoke(item: pytest.Item) -> bool:

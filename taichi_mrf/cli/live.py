@@ -14,8 +14,8 @@ from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, prin
 from taichi_mrf.cli.shared.terminal import print_problem
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.errors import ConfigError, TaichiMRFError
-from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.runs.files import holds_run
+from taichi_mrf.session.link import ViewerLink
 from taichi_mrf.viewer.messages import Listening, Status, Update
 
 if TYPE_CHECKING:
@@ -47,10 +47,10 @@ def run_live(options: Live) -> int:
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.cli.shared.learn_noise import learn_noise
-        from taichi_mrf.live.run import Policy
-        from taichi_mrf.live.session import Session
-        from taichi_mrf.live.source import open_source
         from taichi_mrf.runs.folder import write_run
+        from taichi_mrf.session.run import Policy
+        from taichi_mrf.session.session import Session
+        from taichi_mrf.session.source import open_source
 
         def learn(dataset: "Dataset", config: Config) -> "LearntSigma":
             with ProgressBar(console, options.printing) as progress:

@@ -11,7 +11,7 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
-from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.session.link import ViewerLink
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.link import NoPage, start_page
 from taichi_mrf.viewer.tune.messages import FrameChoice

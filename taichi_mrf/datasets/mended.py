@@ -26,7 +26,6 @@ ORIGIN_STEP_M = 1000.0
 """Origins are multiples of it, so that recordings of one place have the same one."""
 
 T_AXES_OPTICAL: dict[str, NDArray[np.float64]] = {
-    "": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
@@ -41,7 +40,8 @@ def pose_of(T_recorded: Pose, conventions: Conventions) -> Pose:
         T = pose_from_quaternion(np.array([*T[:3, 3], x, y, z, w]))
     if conventions.inverse:
         T = inverse(T)
-    T[:3, :3] = T[:3, :3] @ T_AXES_OPTICAL[conventions.axes]
+    if conventions.axes:  # a product with the identity would lose the sign of zeros, which orders keyframes
+        T[:3, :3] = T[:3, :3] @ T_AXES_OPTICAL[conventions.axes]
     if conventions.mounting:
         T = T @ pose_from_quaternion(np.array(conventions.mounting))
     return T

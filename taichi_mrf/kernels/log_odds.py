@@ -43,16 +43,6 @@ def exp_of_negative(x: F32) -> F32:
 
 
 @ti.func
-def log_of_rest(x: F32) -> F32:
-    """log(1 - e^x) for x < 0, with all digits where e^x is nearly 1."""
-    small = -x
-    rest = small * (1.0 - small * (0.5 - small * (1.0 / 6.0)))
-    if small >= 0.05:
-        rest = 1.0 - ti.exp(x)
-    return ti.log(ti.max(rest, 1e-30))
-
-
-@ti.func
 def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32:
     """log(occupied / empty), clamped, and moved from [-clamp, clamp] to [0, 1] for the accumulators.
 

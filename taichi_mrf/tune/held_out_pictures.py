@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import NOT_JUDGED, RIGHT, JudgedView
-from taichi_mrf.live.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.unrolled import unrolled
+from taichi_mrf.session.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
 from taichi_mrf.tune.history import History
 from taichi_mrf.viewer.tune.messages import HeldOutView, Residuals
 

@@ -4,8 +4,8 @@ import signal
 from collections.abc import Callable, Hashable
 from multiprocessing.connection import Connection
 
-from taichi_mrf.live.link import ViewerLink
-from taichi_mrf.live.outbox import Outbox, Waiting, WaitingBricks
+from taichi_mrf.session.link import ViewerLink
+from taichi_mrf.session.outbox import Outbox, Waiting, WaitingBricks
 from taichi_mrf.viewer.messages import Hello, KeyframeInfo, Request, Update
 from taichi_mrf.viewer.tune.messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
 

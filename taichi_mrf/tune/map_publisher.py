@@ -1,8 +1,8 @@
 """Sends the map of the selected try to the page, as changes to the map before."""
 
-from taichi_mrf.live.link import Link
-from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.outbox import merged
+from taichi_mrf.session.link import Link
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.outbox import merged
 from taichi_mrf.system import runtime
 from taichi_mrf.tune.trial import Trial
 from taichi_mrf.viewer.messages import Hello

@@ -106,11 +106,6 @@ class Search:
             self._study.tell(trial, state=self._failed)
 
 
-def require_optuna() -> None:
-    """Raises ConfigError if Optuna is not installed."""
-    _optuna()
-
-
 def _optuna() -> Any:
     return library("optuna", "--auto needs", "auto", ConfigError)
 

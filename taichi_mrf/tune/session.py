@@ -14,8 +14,8 @@ from typing import Any
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, TaichiMRFError
-from taichi_mrf.live.link import Link
-from taichi_mrf.live.session_core import WAIT_SECONDS, SessionCore
+from taichi_mrf.session.link import Link
+from taichi_mrf.session.session_core import WAIT_SECONDS, SessionCore
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures, residuals_of

@@ -15,10 +15,10 @@ from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.live.source import open_source
 from taichi_mrf.mapping import follow, pipeline
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import load_map
+from taichi_mrf.session.source import open_source
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 

@@ -26,8 +26,8 @@ from datasets_recordings import (
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse
-from taichi_mrf.live.source import open_source
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.session.source import open_source
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes_at_a_glanc
 from taichi_mrf.doctor.picture import overlap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
-from taichi_mrf.live.source import open_source
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.source import open_source
 
 SHARED = {
     "seven_scenes_redkitchen": 100,

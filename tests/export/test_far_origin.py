@@ -20,6 +20,8 @@ from taichi_mrf.methods.registry import load_map
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.sensor.frame import Frame
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 ORIGIN = (412_000.0, 5_412_000.0, 0.0)
 
 

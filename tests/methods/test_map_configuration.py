@@ -14,10 +14,10 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.live.source import open_source
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.session.source import open_source
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import MANIFEST
 

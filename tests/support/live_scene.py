@@ -9,14 +9,14 @@ import small_room
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
-from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.run import Policy
-from taichi_mrf.live.session import Session
-from taichi_mrf.live.source import Source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.replay import Replay
+from taichi_mrf.session.run import Policy
+from taichi_mrf.session.session import Session
+from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import (
     LOG_ODDS_STEP,
     Bricks,

@@ -101,7 +101,7 @@ class _Run:
         return query_tables(rows, self.title), [row.to_json() for row in rows], None
 
     def viewer(self) -> Measured:
-        from taichi_mrf.live.bench import bench_viewer  # the page's packages are slow to import
+        from taichi_mrf.session.bench import bench_viewer  # the page's packages are slow to import
 
         rows = [bench_viewer(self.frames, config, advance) for config, advance in self.each_size()]
         figures = [

@@ -13,7 +13,7 @@ from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.benchmark.profile import KernelCost, Profile
 
 if TYPE_CHECKING:  # the page's packages are slow to import
-    from taichi_mrf.live.bench import ViewerRow
+    from taichi_mrf.session.bench import ViewerRow
 
 HOST_ROWS = 12
 """Functions of the host that are listed, at most; the rest is one row."""

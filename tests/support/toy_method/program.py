@@ -19,8 +19,8 @@ def main(folder: Path) -> None:
     from taichi_mrf.config.schema import Config, load
     from taichi_mrf.config.text import commented_yaml
     from taichi_mrf.errors import TaichiMRFError
-    from taichi_mrf.live.mapper import Mapper
     from taichi_mrf.methods.registry import create_map, load_map
+    from taichi_mrf.session.mapper import Mapper
 
     taichi_mrf.init("cpu")
     (folder / "config.yaml").write_text(

@@ -5,9 +5,9 @@ from collections import deque
 from collections.abc import Callable
 
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.replay import Replay
 from taichi_mrf.methods.statistics import MapStatistics
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.replay import Replay
 from taichi_mrf.viewer.messages import Status
 
 RATE_SECONDS = 5.0

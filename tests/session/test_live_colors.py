@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from live_scene import CONFIG, FakeLink, finished, session_of
 
-from taichi_mrf.live.outbox import Outbox
 from taichi_mrf.queries.colored import shown_colors_in
+from taichi_mrf.session.outbox import Outbox
 from taichi_mrf.viewer.messages import BrickColors, Hello, Switch, Watch
 from taichi_mrf.voxels.layout import grid_keys
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from window_walk import add, windowed
 
-from taichi_mrf.live.baseline_overlay import BaselineOverlay
-from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.baseline_overlay import BaselineOverlay
+from taichi_mrf.session.mapper import Mapper
 
 pytest.importorskip("zarr", reason="a window needs the extra store")
 pytestmark = pytest.mark.usefixtures("one_backend")

@@ -9,10 +9,10 @@ from taichi_mrf.config.schema import Config, without_window
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import Progress
-from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.publish import Publisher
 from taichi_mrf.viewer.messages import Bricks
 
 LEAST_LOG_ODDS = 0.0

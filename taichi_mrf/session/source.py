@@ -18,7 +18,6 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.unused_color import note_unused_color
 from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.methods.map_file import open_map_file, read_header
@@ -26,6 +25,7 @@ from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.runs.noise import noise_notes
+from taichi_mrf.session.replay import Replay
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file
 

@@ -11,8 +11,8 @@ from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.evaluation.pictures.surface_view import smooth_borders
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.live import extras
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.session import extras
 from taichi_mrf.viewer.messages import (
     File,
     Freeze,

@@ -13,11 +13,11 @@ from collections.abc import Callable, Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.live.live_keyframes import LiveKeyframe
-from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.capabilities import has_dates, has_layers
 from taichi_mrf.methods.mrf.layers import NOTHING_MOVES, Moving
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.session.live_keyframes import LiveKeyframe
+from taichi_mrf.session.publish import Publisher
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, TimeSpan
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool

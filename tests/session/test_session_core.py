@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taichi_mrf.live.session_core import Inbox
+from taichi_mrf.session.session_core import Inbox
 from taichi_mrf.viewer.messages import Freeze, Move, Pause, Request, Reset, Save, Speed, Step, Switch
 from taichi_mrf.viewer.tune.messages import SaveTries
 

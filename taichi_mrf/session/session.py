@@ -21,15 +21,6 @@ from collections.abc import Callable, Generator
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.live.extras import Extras
-from taichi_mrf.live.link import Link
-from taichi_mrf.live.live_keyframes import LiveKeyframe
-from taichi_mrf.live.progress import sweeping
-from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.requests import Requests, resumes_replay
-from taichi_mrf.live.run import Policy, Run
-from taichi_mrf.live.session_core import EDITS, WAIT_SECONDS
-from taichi_mrf.live.source import Source
 from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S
 from taichi_mrf.mapping.intake import Added, Full, Lost, Skipped, UnreadableFrame
 from taichi_mrf.mapping.loops import Closure
@@ -37,6 +28,15 @@ from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, RoundStep
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.extras import Extras
+from taichi_mrf.session.link import Link
+from taichi_mrf.session.live_keyframes import LiveKeyframe
+from taichi_mrf.session.progress import sweeping
+from taichi_mrf.session.replay import Replay
+from taichi_mrf.session.requests import Requests, resumes_replay
+from taichi_mrf.session.run import Policy, Run
+from taichi_mrf.session.session_core import EDITS, WAIT_SECONDS
+from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
 REQUEST_SECONDS = 0.25

@@ -11,14 +11,14 @@ from typing import Protocol
 import numpy as np
 
 from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
-from taichi_mrf.live.baseline_overlay import BaselineOverlay
-from taichi_mrf.live.change_list import ChangeList
-from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.pictures import view_images
-from taichi_mrf.live.run import Run
-from taichi_mrf.live.shown_surface import ShownSurface
 from taichi_mrf.methods.capabilities import takes_colors
 from taichi_mrf.queries.colored import painted
+from taichi_mrf.session.baseline_overlay import BaselineOverlay
+from taichi_mrf.session.change_list import ChangeList
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.pictures import view_images
+from taichi_mrf.session.run import Run
+from taichi_mrf.session.shown_surface import ShownSurface
 from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Update, Watch
 from taichi_mrf.voxels.layout import VOXELS, by_chunk
 

@@ -9,14 +9,14 @@ import small_room
 from live_scene import CONFIG, FakeLink, RoomFrames, Shown, finished, map_voxels, session_of, shown
 
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.live.run import Policy
-from taichi_mrf.live.session import Session
-from taichi_mrf.live.shown_map import ShownMap
-from taichi_mrf.live.source import Source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.run import Policy
+from taichi_mrf.session.session import Session
+from taichi_mrf.session.shown_map import ShownMap
+from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Bricks, SceneChanges, ShowTime, Switch, TimeSpan
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -91,7 +91,7 @@ def test_the_past_is_sent_and_the_present_comes_back() -> None:
 
 
 def test_the_past_follows_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.live.shown_map.RENEW_SECONDS", 0.0)
+    monkeypatch.setattr("taichi_mrf.session.shown_map.RENEW_SECONDS", 0.0)
     m = visited_map(DATED.time)
     shown_map, before_s = ShownMap(m), START_S + EMPTY - 1
     view = hear(Shown(), shown_map)
@@ -154,7 +154,7 @@ def test_a_saved_map_is_done_at_once_with_what_moves_and_its_past_brings_its_mes
 
 
 def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.live.change_list.SHARE_OF_TIME", 1.0)
+    monkeypatch.setattr("taichi_mrf.session.change_list.SHARE_OF_TIME", 1.0)
     link = FakeLink()
     finished(session_of(link, visited(), DATED))
     (latest,) = [update.changes for update in link.of_type(SceneChanges)][-1:]
@@ -168,7 +168,7 @@ def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPat
 
 
 def test_nothing_is_listed_of_a_scene_in_which_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.live.change_list.SHARE_OF_TIME", 1.0)
+    monkeypatch.setattr("taichi_mrf.session.change_list.SHARE_OF_TIME", 1.0)
     link = FakeLink()
     finished(session_of(link, VisitedRoom("empty", small_room.frames()[0].camera, count=EMPTY), DATED))
     assert link.of_type(SceneChanges) == []

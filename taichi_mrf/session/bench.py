@@ -18,9 +18,9 @@ from websockets.typing import Origin, Subprotocol
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.geometry.up import up_of
-from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.publish import Publisher
 from taichi_mrf.viewer.messages import Bricks, Hello
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.options import ViewOptions

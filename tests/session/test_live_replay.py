@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.replay import Replay
 
 CAMERA = PinholeCamera(width=4, height=3, fx=4.0, fy=4.0, cx=1.5, cy=1.0)
 

@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.schedule import InferReport
-from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
-from taichi_mrf.live.pictures import thumbnail
-from taichi_mrf.live.ray_answers import PosedDepthImage
-from taichi_mrf.live.shown_map import ShownMap
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
@@ -25,6 +21,10 @@ from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.sensor.own_evidence import NOTHING
+from taichi_mrf.session.live_keyframes import LiveKeyframe, LiveKeyframes
+from taichi_mrf.session.pictures import thumbnail
+from taichi_mrf.session.ray_answers import PosedDepthImage
+from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 

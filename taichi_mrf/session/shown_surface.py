@@ -13,9 +13,9 @@ from taichi_mrf.evaluation.pictures.surface_view import PHOTO_VOXEL_M, DrawnSurf
 from taichi_mrf.evaluation.pictures.surfaces import up_direction, upward_axis
 from taichi_mrf.evaluation.pictures.viewpoint import overview_pose
 from taichi_mrf.geometry.up import Z_UP
-from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.methods.capabilities import MeasuringMap, measures_surface
 from taichi_mrf.queries.colored import marginals_behind
+from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.viewer.messages import SurfacePatch, SurfaceView, Update, pack_log_odds
 from taichi_mrf.voxels.layout import BRICK, by_chunk
 

@@ -8,10 +8,10 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.methods.capabilities import has_dates
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.queries.changed_things import find_changed_things, without_slack
+from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.viewer.messages import SceneChange, SceneChanges
 from taichi_mrf.voxels.layout import grid_keys
 

@@ -6,14 +6,6 @@ from pathlib import Path
 
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.live.link import Link
-from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.pictures import outlined
-from taichi_mrf.live.progress import Progress
-from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.session_core import SessionCore
-from taichi_mrf.live.shown_map import time_span
-from taichi_mrf.live.source import Source, saved_unsettled
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
@@ -28,6 +20,14 @@ from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.link import Link
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.pictures import outlined
+from taichi_mrf.session.progress import Progress
+from taichi_mrf.session.replay import Replay
+from taichi_mrf.session.session_core import SessionCore
+from taichi_mrf.session.shown_map import time_span
+from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from live_program import wait_for
 from live_scene import Shown
 
-from taichi_mrf.live.link import ViewerLink
-from taichi_mrf.live.outbox import BRICKS_AT_ONCE, Outbox, merged
+from taichi_mrf.session.link import ViewerLink
+from taichi_mrf.session.outbox import BRICKS_AT_ONCE, Outbox, merged
 from taichi_mrf.viewer.messages import (
     Alive,
     Bricks,
@@ -174,7 +174,7 @@ def heard(link: ViewerLink, count: int) -> list:
 
 
 def test_a_viewer_says_where_it_is_gets_updates_and_ends_when_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.live.link.GOODBYE_SECONDS", 60.0)  # as long as a busy machine needs
+    monkeypatch.setattr("taichi_mrf.session.link.GOODBYE_SECONDS", 60.0)  # as long as a busy machine needs
     link = ViewerLink("127.0.0.1", 1234, stand_in_viewers.echo)
     try:
         assert heard(link, 1) == [Listening("127.0.0.1", 1234)]

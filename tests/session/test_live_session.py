@@ -27,12 +27,12 @@ from live_scene import (
 
 from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.live.run import Policy
-from taichi_mrf.live.session import Session
-from taichi_mrf.live.source import Source, open_source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
+from taichi_mrf.session.run import Policy
+from taichi_mrf.session.session import Session
+from taichi_mrf.session.source import Source, open_source
 from taichi_mrf.viewer.messages import (
     Bricks,
     File,
@@ -390,7 +390,7 @@ def test_a_defect_in_inference_is_told_once(monkeypatch: pytest.MonkeyPatch) -> 
     def defect(m: OccupancyMap, keep_before: bool) -> None:
         raise RuntimeError("something is wrong")
 
-    monkeypatch.setattr("taichi_mrf.live.mapper.FullInference", defect)
+    monkeypatch.setattr("taichi_mrf.session.mapper.FullInference", defect)
     link = FakeLink()
     session_of(link, room(2)).run(never)
     assert link.errors() == ["something is wrong"]
@@ -425,7 +425,7 @@ def test_a_signal_is_noticed_between_any_two_requests() -> None:
 def test_clients_that_never_stop_moving_a_keyframe_do_not_stop_mapping(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("taichi_mrf.live.session.REQUEST_SECONDS", 0.0)
+    monkeypatch.setattr("taichi_mrf.session.session.REQUEST_SECONDS", 0.0)
     T = small_room.frames()[0].T_world_camera
     link = FakeLink()
     session = session_of(link, room(4))

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_scene import Shown, map_voxels
 
-from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.session.publish import Publisher
 from taichi_mrf.viewer.messages import Bricks, pack_log_odds
 
 pytestmark = pytest.mark.usefixtures("one_backend")

@@ -30,9 +30,6 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.run import Policy
-from taichi_mrf.live.session import Session
 from taichi_mrf.mapping import rounds
 from taichi_mrf.mapping.loops import Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
@@ -40,6 +37,9 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.runs.files import TRAJECTORY_FILE
 from taichi_mrf.runs.folder import write_run
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.replay import Replay
+from taichi_mrf.session.run import Policy
+from taichi_mrf.session.session import Session
 from taichi_mrf.viewer.messages import (
     CurrentCamera,
     KeyframeInfo,

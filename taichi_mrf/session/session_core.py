@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import ClassVar
 
-from taichi_mrf.live.link import Link
+from taichi_mrf.session.link import Link
 from taichi_mrf.viewer.messages import (
     Freeze,
     Move,

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Protocol
 
-from taichi_mrf.live.outbox import Outbox
+from taichi_mrf.session.outbox import Outbox
 from taichi_mrf.viewer.messages import Notice, Quit, Request, Update
 
 GOODBYE_SECONDS = 0.5
