@@ -22,8 +22,8 @@ from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
-from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
-from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.atomic import write_text

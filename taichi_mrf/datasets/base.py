@@ -3,15 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.errors import FrameError
+from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
@@ -162,3 +164,82 @@ class Dataset(ABC):
         """All frames in order. A broken one raises FrameError, which ends the iteration; to go on after
         it, call :meth:`read` with each index."""
         return (self.read(index) for index in range(len(self)))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One frame in a :class:`Table`; a format adds where its images are.
+
+    ``pose`` is T_world_camera, (4, 4), or reads it: that raises DatasetError, which names the file, or
+    KeyframeError for an invalid pose; ``pose_source`` then names the file, or the file and the line.
+    """
+
+    name: str
+    stamp: float
+    pose: Pose | Callable[[], Pose]
+    pose_source: str
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+@dataclass
+class Table(Dataset, Generic[AnyRow]):
+    """A recording as a table with a row for each frame. A format fills it, and says how a row is loaded."""
+
+    rows: Sequence[AnyRow] = field(kw_only=True)
+    confidence: Confidence | None = field(default=None, kw_only=True)
+    """What the images of confidence mean that come with the frames, None without."""
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """What the confidence is relative to, None without."""
+        return None if self.confidence is None else self.confidence.sigma
+
+    @property
+    def states_pixel_sigma(self) -> bool:
+        """Whether there are images of confidence."""
+        return self.confidence is not None
+
+    @property
+    def sigma_origin(self) -> str:
+        """Where the confidence's comes from."""
+        return super().sigma_origin if self.confidence is None else self.confidence.origin
+
+    @abstractmethod
+    def load(self, index: int, row: AnyRow, T_world_camera: Pose) -> Frame:
+        """The frame of a row. Raises DatasetError, which names the file."""
+
+    @cached_property
+    def frame_names(self) -> Sequence[str]:
+        """The names of the rows."""
+        return [row.name for row in self.rows]
+
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [row.stamp for row in self.rows]
+
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame. Raises FrameError, which names the frame and the file; IndexError outside 0
+        to len - 1."""
+        row = self._row(index)
+        try:
+            return row.pose() if callable(row.pose) else row.pose
+        except KeyframeError as error:
+            raise FrameError(f"frame {row.name}: {row.pose_source}: {error}") from error
+        except DatasetError as error:
+            raise FrameError(f"frame {row.name}: {error}") from error
+
+    def read(self, index: int) -> Frame:
+        """Read one frame. Raises FrameError, which names the frame and the file, if its images or its pose
+        are missing, damaged or do not fit; IndexError outside 0 to len - 1."""
+        row, T_world_camera = self._row(index), self.pose(index)
+        try:
+            return self.load(index, row, T_world_camera)
+        except DatasetError as error:
+            raise FrameError(f"frame {row.name}: {error}") from error
+
+    def _row(self, index: int) -> AnyRow:
+        if not 0 <= index < len(self.rows):
+            raise IndexError(f"{self.name} has {len(self.rows)} frames, there is no frame {index}")
+        return self.rows[index]

@@ -21,9 +21,6 @@ _NAMED = re.compile(r"\b(fx|fy|cx|cy|width|height|skew|s)\b\s*[:=]\s*([-+.\w]+)"
 _OTHER_SIZE, _SAME_PROPORTIONS = 0.75, 1.05
 """A principal point is off the middle of images of its own size by less, as a share of the size."""
 
-PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-"""The defaults of PrimeSense drivers (Kinect 1, Xtion), which ROS uses too."""
-
 CAMERA_FILES = (
     "camera.txt",
     "camera.yaml",

@@ -16,6 +16,9 @@ DISTORTION_COUNTS = (4, 5, 8)
 TRACK = "track"
 """In place of a file of poses: find them from the images."""
 
+PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+"""The defaults of PrimeSense drivers (Kinect 1, Xtion), which ROS uses too."""
+
 T = TypeVar("T")
 
 

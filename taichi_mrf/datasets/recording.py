@@ -3,20 +3,19 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
-from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -29,104 +28,46 @@ _LOOKED_AT = 4
 
 
 @dataclass(frozen=True)
-class RecordedFrame:
-    """The files of one frame.
+class RecordedFrame(Row):
+    """The files of one frame. ``camera`` is its own, None for the recording's."""
 
-    ``read_pose`` gives T_world_camera. It raises DatasetError, which names the file, or KeyframeError
-    for an invalid pose; ``pose_source`` then names the file, or the file and the line. ``camera`` is its own,
-    None for the recording's.
-    """
-
-    name: str
-    stamp: float
     depth_file: Path
-    read_pose: Callable[[], Pose]
-    pose_source: str
     color_file: Path | None = None
     confidence_file: Path | None = None
     camera: PinholeCamera | None = None
 
 
 @dataclass
-class Recording(Dataset):
+class Recording(Table[RecordedFrame]):
     """Frames in files, read on request.
 
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
     ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``color_camera`` took the
-    colour images, unless they are registered to depth. ``confidence`` tells what images of confidence mean,
-    where there are some.
+    colour images, unless they are registered to depth.
     """
 
     camera: PinholeCamera
-    frames: Sequence[RecordedFrame] = ()
     steps_per_metre: float = 1000.0
     scale_source: str = "the format's"
     scale_assumed: bool = False
     color: bool = True
     color_camera: ColorCamera | None = None
-    confidence: Confidence | None = None
-    _names: list[str] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._names = [frame.name for frame in self.frames]
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The names of the frames in order, for errors and reports."""
-        return self._names
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return None if self.confidence is None else self.confidence.sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return super().sigma_origin if self.confidence is None else self.confidence.origin
 
     @property
     def states_pixel_sigma(self) -> bool:
         """Whether frames have images of confidence."""
-        return any(frame.confidence_file is not None for frame in self.frames)
+        return any(frame.confidence_file is not None for frame in self.rows)
 
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [frame.stamp for frame in self.frames]
-
-    def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises FrameError, which names the frame and the file."""
-        recorded = self.frames[index]
-        try:
-            return recorded.read_pose()
-        except KeyframeError as error:
-            raise FrameError(f"frame {recorded.name}: {recorded.pose_source}: {error}") from error
-        except DatasetError as error:
-            raise FrameError(f"frame {recorded.name}: {error}") from error
-
-    def read(self, index: int) -> Frame:
-        """Read one frame from disk.
-
-        Raises FrameError, which names the frame and the file, if the depth or colour image is missing,
-        damaged, of the wrong type or of another size than the camera's, or if the pose is missing or
-        invalid. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.frames):
-            raise IndexError(f"{self.name} has {len(self.frames)} frames, there is no frame {index}")
-        recorded = self.frames[index]
-        camera = recorded.camera or self.camera
-        T_world_camera = self.pose(index)
+    def load(self, index: int, row: RecordedFrame, T_world_camera: Pose) -> Frame:
+        """Read the images of one frame, which must have the camera's size."""
+        camera = row.camera or self.camera
         color = sigma_m = None
-        try:
-            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, camera)
-            if self.color and recorded.color_file is not None:
-                color = self._read_color(recorded.color_file, depth_m, camera)
-            if self.confidence is not None and recorded.confidence_file is not None:
-                sigma_m = self._read_sigma(recorded.confidence_file, depth_m, self.confidence, camera)
-        except DatasetError as error:
-            raise FrameError(f"frame {recorded.name}: {error}") from error
-        parts = (camera, recorded.stamp, recorded.name, color, sigma_m)
-        return Frame(depth_m, T_world_camera, *parts)
+        depth_m = read_depth(row.depth_file, self.steps_per_metre, camera)
+        if self.color and row.color_file is not None:
+            color = self._read_color(row.color_file, depth_m, camera)
+        if self.confidence is not None and row.confidence_file is not None:
+            sigma_m = self._read_sigma(row.confidence_file, depth_m, self.confidence, camera)
+        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, color, sigma_m)
 
     def _read_sigma(
         self, path: Path, depth_m: NDArray[np.float32], confidence: Confidence, camera: PinholeCamera
@@ -153,18 +94,18 @@ class Recording(Dataset):
         An assumed scale is replaced by a usual one with which neighbouring frames agree clearly better; one
         that a file or the caller gives is kept, and a note says that another would agree better.
         """
-        apart = max(1, len(self.frames) // _LOOKED_AT)
+        apart = max(1, len(self.rows) // _LOOKED_AT)
         looked = [
             look_at_depth(frame.depth_file, frame.camera or self.camera)
-            for frame in self.frames[::apart][:_LOOKED_AT]
+            for frame in self.rows[::apart][:_LOOKED_AT]
         ]
         if looked and looked[0][0] and self.scale_source != ASKED:
             self.steps_per_metre, self.scale_source = 1.0, "metres, as the images hold floats"
         own = self.steps_per_metre
         found = gather(
-            len(self.frames) if poses_are_used else min(1, len(self.frames)),
-            lambda index: self.frames[index].read_pose(),
-            lambda index: read_depth(self.frames[index].depth_file, 1.0, self.camera),
+            len(self.rows) if poses_are_used else min(1, len(self.rows)),
+            self.pose,
+            lambda index: read_depth(self.rows[index].depth_file, 1.0, self.camera),
             self.camera,
             tuple(dict.fromkeys((own, *USUAL))),
         )

@@ -18,15 +18,15 @@ sensors must count from one beginning, at poses in one world. Each frame states 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.values import check_field, from_dict
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, Row, Table
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -35,7 +35,6 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-SUFFIXES = (".yaml", ".yml")
 _SOURCE = re.compile(r"[a-z][a-z0-9_]+:")
 
 
@@ -100,56 +99,43 @@ class RecordedSensor:
     range_m: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class SensorFrame(Row):
+    """A frame of a sensor, and its index there."""
+
+    taken_by: RecordedSensor
+    index: int
+
+
 @dataclass
-class SeveralSensors(Dataset):
-    """The frames of several sensors in the order of their stamps. ``places`` has for each the number of its
-    sensor and its index there; ``camera`` is the first sensor's."""
+class SeveralSensors(Table[SensorFrame]):
+    """The frames of several sensors in the order of their stamps; ``camera`` is the first sensor's."""
 
     sensors: Sequence[RecordedSensor] = field(kw_only=True)
-    places: NDArray[np.int64] = field(kw_only=True)
-    frame_stamps: NDArray[np.float64] = field(kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._names = [
-            f"{self.sensors[sensor].name}-{self.sensors[sensor].dataset.frame_names[index]}"
-            for sensor, index in self.places
-        ]
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The sensor's name and that of its frame."""
-        return self._names
 
     @property
     def recorded_reach(self) -> float | None:
         """That of the sensor that reaches farthest."""
         return max(sensor.range_m[1] for sensor in self.sensors)
 
-    def stamps(self) -> NDArray[np.float64]:
-        """When each frame was taken, in seconds."""
-        return self.frame_stamps
-
     def sensor_of(self, index: int) -> str:
         """The name of the sensor that took a frame."""
-        return self.sensors[self.places[index, 0]].name
+        return self.rows[index].taken_by.name
 
-    def read(self, index: int) -> Frame:
-        """The frame of its sensor. Raises FrameError, which names the frame, if that is broken; IndexError
-        outside 0 to len - 1."""
-        if not 0 <= index < len(self.places):
-            raise IndexError(f"{self.name} has {len(self.places)} frames, there is no frame {index}")
-        sensor, name = self.sensors[self.places[index, 0]], self._names[index]
+    def load(self, index: int, row: SensorFrame, T_world_camera: Pose) -> Frame:
+        """The frame of its sensor."""
+        sensor = row.taken_by
         try:
-            frame = sensor.dataset.read(int(self.places[index, 1]))
+            frame = sensor.dataset.read(row.index)
         except FrameError as error:
-            raise FrameError(f"frame {name}: {sensor.name}: {error}") from error
+            raise DatasetError(f"{sensor.name}: {error}") from error
         least, most = sensor.range_m
         inside = (frame.depth_m >= least) & (frame.depth_m <= most)
         return replace(
             frame,
             depth_m=np.where(inside, frame.depth_m, np.float32(0)),
             T_world_camera=frame.T_world_camera @ sensor.T_poses_sensor,
-            name=name,
+            name=row.name,
             noise=frame.noise or sensor.noise,
             sigma_m=None if sensor.given else frame.sigma_m,
             sensor=sensor.name,
@@ -168,26 +154,34 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
     names = [entry.name or f"sensor-{number}" for number, entry in enumerate(described.sensors, start=1)]
     if len(set(names)) < len(names):
         raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
-    sensors, places, stamps = [], [], []
-    for number, (entry, name) in enumerate(zip(described.sensors, names, strict=True)):
+    sensors, rows = [], []
+    for entry, name in zip(described.sensors, names, strict=True):
         try:
             sensor = _open_sensor(path, entry, name, options)
         except (ConfigError, DatasetError, KeyframeError) as error:
             raise DatasetError(f"{path}: {name}: {error}") from error
-        indices = np.arange(0, len(sensor.dataset), entry.every)
+        stamps, frame_names = sensor.dataset.stamps(), sensor.dataset.frame_names
+        for i in range(0, len(sensor.dataset), entry.every):
+            pose = partial(_pose, sensor, i)
+            rows.append(
+                SensorFrame(f"{name}-{frame_names[i]}", float(stamps[i]), pose, sensor.name, sensor, i)
+            )
         sensors.append(sensor)
-        places.append(np.column_stack([np.full(len(indices), number), indices]))
-        stamps.append(np.asarray(sensor.dataset.stamps(), np.float64)[indices])
-    order = np.argsort(np.concatenate(stamps), kind="stable")
     return SeveralSensors(
         path.stem,
         sensors[0].dataset.camera,
         [f"{sensor.name}: {note}" for sensor in sensors for note in sensor.dataset.notes],
         sum(sensor.dataset.dropped for sensor in sensors),
         sensors=sensors,
-        places=np.concatenate(places)[order],
-        frame_stamps=np.concatenate(stamps)[order],
+        rows=sorted(rows, key=lambda row: row.stamp),
     )
+
+
+def _pose(sensor: RecordedSensor, index: int) -> Pose:
+    try:
+        return sensor.dataset.pose(index) @ sensor.T_poses_sensor
+    except FrameError as error:
+        raise DatasetError(f"{sensor.name}: {error}") from error
 
 
 def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions) -> RecordedSensor:

@@ -9,7 +9,6 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
-from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
@@ -153,13 +152,15 @@ def _steps(sample: Sample) -> float:
 
 def _swapped_images(source: Dataset) -> Finding | None:
     """Finding if far more of a stereo recording's pixels match with the left and right images swapped."""
+    from taichi_mrf.datasets.stereo.pairs import StereoPairs  # late: few recordings are stereo
+
     if not isinstance(source, StereoPairs) or not len(source):
         return None
-    swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.pairs]
+    swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.rows]
     given = _matched(source)
     if given > _FEW_MATCHED:
         return None
-    other = _matched(replace(source, pairs=swapped))
+    other = _matched(replace(source, rows=swapped))
     if other < _MORE_MATCHED * given:
         return None
     return Finding(
@@ -168,7 +169,7 @@ def _swapped_images(source: Dataset) -> Finding | None:
     )
 
 
-def _matched(pairs: StereoPairs) -> float:
+def _matched(pairs: Dataset) -> float:
     """The share of pixels with a depth, of the first frame, the last and one between."""
     indices = {0, len(pairs) // 2, len(pairs) - 1}
     return float(np.mean([(pairs.read(index).depth_m > 0).mean() for index in indices]))

@@ -7,7 +7,7 @@ import pytest
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.formats.numbered_depth import ICL_NUIM
-from taichi_mrf.datasets.intrinsics import PRIMESENSE
+from taichi_mrf.datasets.options import PRIMESENSE
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -8,21 +8,22 @@ before. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be le
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.base import Row, Table, start_pose
 from taichi_mrf.datasets.depth_scale import check_metres
 from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest
 from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
-from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_folder
@@ -42,66 +43,44 @@ class Part:
     steps_per_metre: float
 
 
+@dataclass(frozen=True)
+class NpzFrame(Row):
+    """The ``number``-th frame, from 0, of a file."""
+
+    part: Part
+    number: int
+
+
 @dataclass
-class FramesNpz(Dataset):
+class FramesNpz(Table[NpzFrame]):
     """The frames of one or more files, with cameras of their ``own`` unless the caller's holds for all. The
     images of the file that was read last are kept in memory. The caller may have given the depth's scale."""
 
-    parts: Sequence[Part] = field(kw_only=True)
     color: bool = True
     own: bool = False
     scale_given: bool = False
     _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
 
-    def __post_init__(self) -> None:
-        every = [(part, i) for part in self.parts for i in range(len(part.poses))]
-        self._places = [(part, i) for part, i in every if np.isfinite(part.poses[i]).all()] or every
-        if len(self._places) < len(every):
-            self.dropped = len(every) - len(self._places)
-            self.notes.append(f"{self.dropped} of {len(every)} images dropped: tracking was lost ({POSE})")
-        self._names = [
-            f"{part.path.stem}-{i:06d}" if len(part.poses) > 1 else part.path.stem for part, i in self._places
-        ]
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The file's name, with the frame's number in it if it holds several."""
-        return self._names
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [float(part.stamps[i]) for part, i in self._places]
-
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """A note of whole numbers that are no measurements; the unit is known."""
         try:
-            depth, _ = self._images(self.parts[0])
+            depth, _ = self._images(self.rows[0].part)
         except DatasetError:  # reported when a frame is read
             return []
-        if depth.dtype.kind == "f" and self.parts[0].steps_per_metre == 1 and not self.scale_given:
-            check_metres(list(depth[:: max(1, len(depth) // 4)]), f"{self.parts[0].path}: {DEPTH}")
+        first = self.rows[0].part
+        if depth.dtype.kind == "f" and first.steps_per_metre == 1 and not self.scale_given:
+            check_metres(list(depth[:: max(1, len(depth) // 4)]), f"{first.path}: {DEPTH}")
         return note_of_largest([share_of_largest(image) for image in depth[:: max(1, len(depth) // 4)]])
 
-    def read(self, index: int) -> Frame:
-        """Read one frame. Raises FrameError, which names frame, file and field, for damaged images and
-        for an invalid pose; IndexError outside 0 to len - 1."""
-        if not 0 <= index < len(self._places):
-            raise IndexError(f"{self.name} has {len(self._places)} frames, there is no frame {index}")
-        part, i = self._places[index]
-        name = self._names[index]
-        try:
-            T_world_camera = as_pose(part.poses[i])
-            depth, color = self._images(part)
-        except KeyframeError as error:
-            raise FrameError(f"frame {name}: {part.path}: {POSE}: {error}") from error
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
+    def load(self, index: int, row: NpzFrame, T_world_camera: Pose) -> Frame:
+        """One frame of its file's arrays."""
+        (depth, color), part, i = self._images(row.part), row.part, row.number
         values = measured(depth[i]) if depth.dtype.kind == "u" else depth[i]
         depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)
         depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
         image = None if color is None else color[i]
         camera = part.cameras[i] if self.own else self.camera
-        return Frame(depth_m, T_world_camera, camera, float(part.stamps[i]), name, image)
+        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, image)
 
     def _images(self, part: Part) -> tuple[NDArray, NDArray | None]:
         if self._loaded is None or self._loaded[0] != part.path:
@@ -131,8 +110,21 @@ def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     for each in paths:
         parts.append(_read_part(each, options, first=sum(len(part.poses) for part in parts)))
     own = options.camera is None and options.intrinsics is None
-    given = options.depth_scale is not None
-    return FramesNpz(name, parts[0].cameras[0], parts=parts, color=options.color, own=own, scale_given=given)
+    every = [row for part in parts for row in _rows(part)]
+    rows = [row for row in every if np.isfinite(row.part.poses[row.number]).all()] or every
+    lost, given = len(every) - len(rows), options.depth_scale is not None
+    notes = [f"{lost} of {len(every)} images dropped: tracking was lost ({POSE})"] if lost else []
+    return FramesNpz(
+        name, parts[0].cameras[0], notes, lost, rows=rows, color=options.color, own=own, scale_given=given
+    )
+
+
+def _rows(part: Part) -> Iterator[NpzFrame]:
+    """The frames of a file, named as the file is, with their numbers if it holds several."""
+    for i, pose in enumerate(part.poses):
+        name = f"{part.path.stem}-{i:06d}" if len(part.poses) > 1 else part.path.stem
+        where = f"{part.path}: {POSE}"
+        yield NpzFrame(name, float(part.stamps[i]), partial(as_pose, pose), where, part, i)
 
 
 def _read_part(path: Path, options: ReadOptions, first: int) -> Part:

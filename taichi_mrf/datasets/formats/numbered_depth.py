@@ -28,9 +28,9 @@ from taichi_mrf.datasets.entries import NUMBERED_FILES, NUMBERED_IMAGE, numbered
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
 from taichi_mrf.datasets.hints import image_hint, pose_files_hint
 from taichi_mrf.datasets.images import holds_depth
-from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
+from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera, own_cameras
 from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
-from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
@@ -81,7 +81,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         camera=camera,
         notes=assumed + notes,
         dropped=len(images) - len(frames),
-        frames=frames,
+        rows=frames,
         steps_per_metre=options.depth_scale or (1000.0 if trajectory.layout == "log" else 5000.0),
         scale_source=ASKED if options.depth_scale else f"assumed as {name} has it",
         scale_assumed=options.depth_scale is None,
@@ -183,7 +183,7 @@ def _frame(
         name=path.stem,
         stamp=_stamp(path, number, trajectory),
         depth_file=path,
-        read_pose=partial(_read_pose, trajectory.path, pose, mirror),
+        pose=partial(_read_pose, trajectory.path, pose, mirror),
         pose_source=str(trajectory.path) if pose is None else pose.source,
         color_file=next((color for color in colors if color.is_file()), None),
     )

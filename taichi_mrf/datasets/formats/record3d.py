@@ -12,13 +12,14 @@ Level 2 leaves the sigma, level 1 doubles it, and pixels of level 0 are no measu
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.base import Row, Table, start_pose
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.formats.record3d_files import (
@@ -33,87 +34,48 @@ from taichi_mrf.datasets.formats.record3d_metadata import MOST_PIXELS, Metadata,
 from taichi_mrf.datasets.images import decode_color
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_file
 
-SUFFIX, METADATA, IMAGES = ".r3d", "metadata", "rgbd"
+METADATA, IMAGES = "metadata", "rgbd"
 _MOST_METADATA, _MOST_IMAGE = 1 << 27, 1 << 26
 _MOST_DIGITS = 9
 _ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+@dataclass(frozen=True)
+class Record3DFrame(Row):
+    """A frame and its number."""
+
+    number: int
+
+
 @dataclass
-class Record3D(Dataset):
-    """The frames of a recording by their ``numbers``. ``cameras`` are those of their colour images, where
+class Record3D(Table[Record3DFrame]):
+    """The frames of a recording. ``cameras`` are those of their colour images, where
     each has its own; None if one holds for all, as the caller's does."""
 
     camera: PinholeCamera
     files: Files = field(kw_only=True)
     metadata: Metadata = field(kw_only=True)
-    numbers: Sequence[int] = field(kw_only=True)
-    frame_stamps: Sequence[float] = field(kw_only=True)
     cameras: Sequence[PinholeCamera] | None = field(kw_only=True)
     steps_per_metre: float = 1.0
     color: bool = True
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The number of each frame in the recording."""
-        return [f"{number:06d}" for number in self.numbers]
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return ARKIT.sigma if self.states_pixel_sigma else None
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return ARKIT.origin if self.states_pixel_sigma else super().sigma_origin
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether frames have images of confidence."""
-        return any(_file(number, "conf") in self.files.names for number in self.numbers)
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return self.frame_stamps
-
-    def read(self, index: int) -> Frame:
-        """Read one frame.
-
-        Raises FrameError, which names frame and file, if depth, confidence or colour is damaged or of another
-        size than it should be, or if the pose is invalid. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.numbers):
-            raise IndexError(f"{self.name} has {len(self.numbers)} frames, there is no frame {index}")
-        number, name = self.numbers[index], self.frame_names[index]
+    def load(self, index: int, row: Record3DFrame, T_world_camera: Pose) -> Frame:
+        """Read depth, confidence and colour, which must have the sizes that they should."""
+        number, own = row.number, None if self.cameras is None else self.cameras[index]
+        camera = self.camera if own is None else _of_depth(own, self.camera.shape)
         color = sigma_m = None
-        try:
-            camera = (
-                self.camera if self.cameras is None else _of_depth(self.cameras[index], self.camera.shape)
-            )
-            T_world_camera = self._pose(number) if self.metadata.has_poses else start_pose()
-            depth_m = self._depth(_file(number, "depth"))
-            if _file(number, "conf") in self.files.names:
-                sigma_m = self._sigma(_file(number, "conf"), depth_m, camera)
-            if self.color and _file(number, "jpg") in self.files.names:
-                own = self.metadata.color_camera if self.cameras is None else self.cameras[index]
-                color = self._color(_file(number, "jpg"), own, depth_m, camera)
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
-        return Frame(depth_m, T_world_camera, camera, self.frame_stamps[index], name, color, sigma_m)
-
-    def _pose(self, number: int) -> Pose:
-        values = self.metadata.poses[number]
-        try:
-            return as_pose(pose_from_quaternion(np.append(values[4:], values[:4])) @ _ARKIT_AXES)
-        except KeyframeError as error:
-            raise DatasetError(f"{self.metadata.where}: pose {number}: {error}") from error
+        depth_m = self._depth(_file(number, "depth"))
+        if _file(number, "conf") in self.files.names:
+            sigma_m = self._sigma(_file(number, "conf"), depth_m, camera)
+        if self.color and _file(number, "jpg") in self.files.names:
+            color = self._color(_file(number, "jpg"), own or self.metadata.color_camera, depth_m, camera)
+        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, color, sigma_m)
 
     def _depth(self, file: str) -> NDArray[np.float32]:
         depth_m = (self._array(file, np.dtype("<f4")) / self.steps_per_metre).astype(np.float32)
@@ -183,12 +145,21 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
         dropped,
         files=files,
         metadata=metadata,
-        numbers=posed,
-        frame_stamps=stamps,
+        confidence=ARKIT if any(_file(number, "conf") in files.names for number in posed) else None,
+        rows=[_row(metadata, number, stamp) for number, stamp in zip(posed, stamps, strict=True)],
         cameras=None if overridden else metadata.cameras(posed),
         steps_per_metre=options.depth_scale or 1.0,
         color=options.color,
     )
+
+
+def _row(metadata: Metadata, number: int, stamp: float) -> Record3DFrame:
+    pose = partial(_pose, metadata.poses[number]) if metadata.has_poses else start_pose()
+    return Record3DFrame(f"{number:06d}", stamp, pose, f"{metadata.where}: pose {number}", number)
+
+
+def _pose(values: NDArray[np.float64]) -> Pose:
+    return as_pose(pose_from_quaternion(np.append(values[4:], values[:4])) @ _ARKIT_AXES)
 
 
 def _check_unpacker(files: Files, first: int) -> None:

@@ -48,7 +48,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         name=folder.name,
         camera=camera,
         notes=notes,
-        frames=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
+        rows=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
         steps_per_metre=options.depth_scale or steps,
         scale_source=ASKED if options.depth_scale else str(parameters or NAME),
         color=options.color,
@@ -62,7 +62,7 @@ def _frame(path: Path, pose: RecordedPose) -> RecordedFrame:
         name=path.stem,
         stamp=int(number) / FRAMES_PER_SECOND,
         depth_file=path,
-        read_pose=pose.T_world_camera,
+        pose=pose.T_world_camera,
         pose_source=pose.source,
         color_file=next((color for color in colors if color.is_file()), None),
     )

@@ -69,7 +69,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         camera=camera,
         notes=notes,
         dropped=dropped,
-        frames=frames,
+        rows=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         scale_source=ASKED if options.depth_scale else NAME,
         color=options.color,
@@ -84,7 +84,7 @@ def _frame(folder: Path, name: str, number: int) -> RecordedFrame:
         name=name,
         stamp=number / FRAMES_PER_SECOND,
         depth_file=folder / f"{name}.depth.png",
-        read_pose=partial(read_matrix_file, pose_file),
+        pose=partial(read_matrix_file, pose_file),
         pose_source=str(pose_file),
         color_file=next((path for path in colors if path.is_file()), None),
     )

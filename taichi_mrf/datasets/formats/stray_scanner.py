@@ -47,9 +47,9 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
             RecordedFrame(
                 path.stem,
                 pose.key,
-                path,
                 pose.T_world_camera,
                 pose.source,
+                path,
                 confidence_file=confidence if is_file(confidence) else None,
                 camera=camera,
             )
@@ -63,7 +63,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         camera=options.camera or own[0] or _camera(folder / MATRIX),
         notes=notes,
         dropped=dropped,
-        frames=frames,
+        rows=frames,
         steps_per_metre=options.depth_scale or 1000.0,
         scale_source=ASKED if options.depth_scale else "Stray Scanner",
         color=False,

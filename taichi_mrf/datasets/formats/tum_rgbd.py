@@ -16,8 +16,8 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
-from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
-from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.intrinsics import find_camera
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.timed_poses import apart_in_words
@@ -80,7 +80,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         camera=camera,
         notes=notes,
         dropped=dropped,
-        frames=frames,
+        rows=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         scale_source=ASKED if options.depth_scale else NAME,
         color=options.color,
@@ -129,7 +129,7 @@ def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path 
         name=depth_file.stem,
         stamp=stamp,
         depth_file=depth_file,
-        read_pose=pose.T_world_camera,
+        pose=pose.T_world_camera,
         pose_source=pose.source,
         color_file=color_file,
     )

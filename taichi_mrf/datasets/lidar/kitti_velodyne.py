@@ -61,10 +61,11 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
         )
     scans = [
         RecordedScan(
-            file.stem, stamp, partial(_read, file, pose, T_camera_lidar, world), str(file), pose.source
+            file.stem, stamp, partial(_pose, pose, T_camera_lidar), pose.source,
+            partial(_points, file, world), str(file),
         )
         for file, stamp, pose in found
-    ]
+    ]  # fmt: skip
     dropped = len(files) - len(scans)
     if not scans:
         raise DatasetError(f"{poses.path}: has a pose for none of the {len(files)} scans in {folder / SCANS}")
@@ -113,12 +114,10 @@ def _poses(folder: Path) -> Trajectory:
 
 
 def _pose(pose: RecordedPose, T_camera_lidar: Pose) -> Pose:
-    T_world_lidar: Pose = inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
-    return T_world_lidar
+    """T_world_lidar."""
+    return inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
 
 
-def _read(
-    file: Path, pose: RecordedPose, T_camera_lidar: Pose, world: bool | None
-) -> tuple[NDArray[np.float64], Pose]:
-    points_m, T_world_lidar = read_cloud(file), _pose(pose, T_camera_lidar)
-    return of_sensor(points_m, T_world_lidar) if world else points_m, T_world_lidar
+def _points(file: Path, world: bool | None, T_world_lidar: Pose) -> NDArray[np.float64]:
+    points_m = read_cloud(file)
+    return of_sensor(points_m, T_world_lidar) if world else points_m

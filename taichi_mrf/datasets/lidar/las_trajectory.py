@@ -28,7 +28,6 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.system.files import is_file
 
-SUFFIXES = (".las", ".laz")
 _MOST_SCANS = 1 << 40
 
 
@@ -66,9 +65,10 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
         if T_world_lidar is None:
             dropped += 1
             continue
-        read = partial(_in_lidar_frame, points_m, members, T_world_lidar)
+        read = partial(_in_lidar_frame, points_m, members)
         starts = partial(_starts, trajectory, times, members, T_world_lidar, gap)
-        scans.append(RecordedScan(f"{number:06d}", stamp, read, str(path), str(poses_path), starts))
+        at = T_world_lidar, str(poses_path)
+        scans.append(RecordedScan(f"{number:06d}", stamp, *at, read, str(path), starts))
     if not scans:
         raise DatasetError(
             f"{path}: none of its {dropped} scans ({times.min():.3f} to {times.max():.3f} s) has poses "
@@ -106,13 +106,11 @@ def _groups(
 
 
 def _in_lidar_frame(
-    points_m: NDArray[np.float64],
-    members: NDArray[np.int64],
-    T_world_lidar: Pose,
-) -> tuple[NDArray[np.float64], Pose]:
-    """The points of a scan in the lidar's frame, and the lidar's pose."""
+    points_m: NDArray[np.float64], members: NDArray[np.int64], T_world_lidar: Pose
+) -> NDArray[np.float64]:
+    """The points of a scan in the lidar's frame."""
     T_lidar_world = inverse(T_world_lidar)
-    return points_m[members] @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3], T_world_lidar
+    return points_m[members] @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
 
 
 def _starts(

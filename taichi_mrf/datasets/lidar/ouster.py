@@ -6,28 +6,28 @@ the sensor; without either the sensor is assumed to stand still. A scan is an im
 the sensor moved meanwhile, each column has a pose of its own (motion.py). Reading needs the extra ``ouster``.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
-from taichi_mrf.datasets.lidar.ouster_files import OSF, check_recording
+from taichi_mrf.datasets.lidar.ouster_files import check_recording
 from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
-from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, said
+from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import check_regular
 from taichi_mrf.system.libraries import library
 
-SUFFIXES = (OSF, ".pcap")
 STANDS_STILL = "contains no poses: the lidar is assumed to stand still; for one that moves add ?poses=FILE"
 _LONGEST_GAP_S = 1.0
 
@@ -51,16 +51,14 @@ class OusterOptions:
 
 
 @dataclass(frozen=True)
-class RecordedColumns:
-    """What is kept of a scan from opening: its number in the source, and its stamp, the middle of its
-    columns."""
+class RecordedColumns(Row):
+    """A scan, stamped in the middle of its columns, and its number in the source."""
 
     number: int
-    stamp: float
 
 
 @dataclass
-class OusterScans(LidarRecording):
+class OusterScans(LidarRecording, Table[RecordedColumns]):
     """The scans of one sensor. ``source`` is ouster.sdk's; ``trajectory`` are poses of the sensor,
     T_world_sensor, from a file, None for those in the recording."""
 
@@ -68,41 +66,19 @@ class OusterScans(LidarRecording):
     source: Any = field(kw_only=True)
     sensor: int = field(kw_only=True)
     beams: Beams = field(kw_only=True)
-    scans: Sequence[RecordedColumns] = field(kw_only=True)
     trajectory: TimedPoses | None = None
     gap: float = INTERPOLATION_GAP
     deskew: bool = True
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The number of each scan in the recording, from 0."""
-        return [f"{scan.number:06d}" for scan in self.scans]
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [scan.stamp for scan in self.scans]
-
-    def read(self, index: int) -> Frame:
-        """Decode one scan. Raises FrameError, which names frame and file, if it is damaged, has no
-        column or no valid pose. Raises IndexError outside 0 to len - 1."""
-        if not 0 <= index < len(self.scans):
-            raise IndexError(f"{self.name} has {len(self.scans)} frames, there is no frame {index}")
-        scan, name = self.scans[index], self.frame_names[index]
+    def load(self, index: int, row: RecordedColumns, T_world_camera: Pose) -> Frame:
+        """Decode one scan, which must have a column."""
         try:
-            columns = columns_of(self.source, scan.number, self.sensor)
-            if columns is None:
-                raise DatasetError("it has no column")
-            at = self._poses(columns)
-            T_world_sensor = at(scan.stamp)
-            if T_world_sensor is None:
-                raise DatasetError("its pose is not known")
-            return self._frame(columns, as_pose(T_world_sensor @ self.beams.T_sensor_lidar), at, scan, name)
-        except (DatasetError, KeyframeError) as error:
-            raise FrameError(f"frame {name}: {self.path}: {error}") from error
-
-    def _frame(
-        self, columns: "Columns", T_world_lidar: Pose, at: PoseAt, scan: RecordedColumns, name: str
-    ) -> Frame:
+            columns = columns_of(self.source, row.number, self.sensor)
+        except DatasetError as error:
+            raise DatasetError(f"{self.path}: {error}") from error
+        if columns is None:
+            raise DatasetError(f"{self.path}: it has no column")
+        at = _poses(columns, self.trajectory, self.gap)
         range_m = self.beams.from_centre(self.beams.shifted(columns.range_m))
         measured = range_m > 0
         looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
@@ -113,18 +89,11 @@ class OusterScans(LidarRecording):
                 T = at(stamp)
                 return None if T is None else T @ self.beams.T_sensor_lidar
 
-            seconds = self.beams.shifted(np.broadcast_to(columns.stamps - scan.stamp, range_m.shape))
-            image = Motion(scan.stamp, T_world_lidar, lidar_at).of_image(image, seconds, looked) or image
-        return Frame(image.range_m, T_world_lidar, image.camera, scan.stamp, name, no_return=image.no_return)
-
-    def _poses(self, columns: "Columns") -> PoseAt:
-        """The sensor's pose at any time of a scan."""
-        if self.tracked:
-            return lambda stamp: np.eye(4)
-        timed, gap = (
-            (columns.poses, _LONGEST_GAP_S) if self.trajectory is None else (self.trajectory, self.gap)
+            seconds = self.beams.shifted(np.broadcast_to(columns.stamps - row.stamp, range_m.shape))
+            image = Motion(row.stamp, T_world_camera, lidar_at).of_image(image, seconds, looked) or image
+        return Frame(
+            image.range_m, T_world_camera, image.camera, row.stamp, row.name, no_return=image.no_return
         )
-        return lambda stamp: timed.at(stamp, gap)
 
 
 @dataclass(frozen=True)
@@ -157,6 +126,18 @@ def columns_of(source: Any, number: int, sensor: int) -> Columns | None:
     return Columns(range_m, stamps, valid, TimedPoses(stamps[valid], poses[valid] @ extrinsic))
 
 
+def _poses(columns: Columns, trajectory: TimedPoses | None, gap: float) -> PoseAt:
+    """The sensor's pose at any time of a scan."""
+    timed, largest_s = (columns.poses, _LONGEST_GAP_S) if trajectory is None else (trajectory, gap)
+    return lambda stamp: timed.at(stamp, largest_s)
+
+
+def _pose(path: Path, T_world_sensor: Pose | None, T_sensor_lidar: Pose) -> Pose:
+    if T_world_sensor is None:
+        raise DatasetError(f"{path}: its pose is not known")
+    return as_pose(T_world_sensor @ T_sensor_lidar)
+
+
 def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     """Open a recording with the options after the question mark of its name, and read the stamps of its
     scans.
@@ -187,7 +168,9 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         if trajectory is not None and trajectory.at(stamp, gap) is None:
             dropped += 1
             continue
-        scans.append(RecordedColumns(number, stamp))
+        T_world_sensor = np.eye(4) if tracked else _poses(columns, trajectory, gap)(stamp)
+        at = partial(_pose, path, T_world_sensor, beams.T_sensor_lidar)
+        scans.append(RecordedColumns(f"{number:06d}", stamp, at, str(path), number))
         poses += [columns.poses.poses[0], columns.poses.poses[-1]]
         if reach_m is None and columns.range_m.any():
             reach_m = reach_of(columns.range_m)
@@ -211,7 +194,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         source=source,
         sensor=chosen.sensor,
         beams=beams,
-        scans=scans,
+        rows=scans,
         trajectory=trajectory,
         gap=gap,
         deskew=chosen.deskew,

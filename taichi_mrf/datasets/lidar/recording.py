@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import DatasetError, FrameError
 
 LIDAR_SIGMA_M = 0.03
 """Standard deviation of range that is assumed: spinning lidars are specified with 2 to 3 cm at all ranges."""
@@ -23,6 +24,20 @@ class LidarRecording(Dataset):
     """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read."""
 
     reach_m: float | None = field(default=None, kw_only=True)
+
+    def look_at_first(self, what: str) -> None:
+        """Set camera and reach from the first scan (``what``) that can be read. Raises DatasetError, which
+        says why the first cannot, if none can."""
+        problem: FrameError | None = None
+        for index in range(len(self)):
+            try:
+                frame = self.read(index)
+            except FrameError as error:
+                problem = problem or error
+                continue
+            self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
+            return
+        raise DatasetError(f"{self.name}: no {what} can be read: {problem}") from problem
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:

@@ -78,7 +78,9 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
         world, frame = _frame_of(posed, found, poses is None)
         notes += frame
     scans = [
-        RecordedScan(cloud.stem, pose.stamp, partial(_scan, cloud, pose, world), str(cloud), pose.source)
+        RecordedScan(
+            cloud.stem, pose.stamp, pose.read, pose.source, partial(_points, cloud, world), str(cloud)
+        )
         for cloud in posed
         for pose in (found[cloud],)
     ]
@@ -167,6 +169,7 @@ def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool)
     ]
 
 
-def _scan(cloud: Path, pose: ScanPose, world: bool) -> tuple[NDArray[np.float64], Pose]:
-    points_m, T_world_sensor = read_cloud(cloud), pose.read()
-    return of_sensor(points_m, T_world_sensor) if world else points_m, T_world_sensor
+def _points(cloud: Path, world: bool, T_world_sensor: Pose) -> NDArray[np.float64]:
+    """The points of a file in the sensor's frame, into which those of the ``world``'s are taken."""
+    points_m = read_cloud(cloud)
+    return of_sensor(points_m, T_world_sensor) if world else points_m

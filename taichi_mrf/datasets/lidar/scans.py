@@ -5,14 +5,15 @@ free rays, one for each point, so every frame has a camera of its own, and depth
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
+from taichi_mrf.datasets.base import Row, Table
+from taichi_mrf.datasets.lidar.recording import LidarRecording
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
@@ -20,71 +21,39 @@ from taichi_mrf.sensor.ray_table import RayTable
 SECONDS_PER_SCAN = 0.1
 """Assumed where nothing tells: most lidars turn ten times a second."""
 
-ScanReader = Callable[[], tuple[NDArray[np.float64], Pose]]
-"""Points (N, 3) in metres in the sensor's frame, NaN and 0 where nothing came back, and T_world_sensor,
-(4, 4). Raises DatasetError, which names the file, or KeyframeError for an invalid pose."""
-
 
 @dataclass(frozen=True)
-class RecordedScan:
-    """One scan of a recording; ``source`` is the file of its points, ``pose_source`` the file, or file and
-    line, of its pose. ``starts`` gives the places (N, 3) in the sensor's frame from which the points that it
-    reads were measured, None if that is its pose."""
+class RecordedScan(Row):
+    """One scan of a recording, whose pose is T_world_sensor.
 
-    name: str
-    stamp: float
-    read: ScanReader
+    ``read_points`` gives its points (N, 3) in metres in the sensor's frame, of which it gets the pose, NaN
+    and 0 where nothing came back; ``source`` is their file. ``starts`` gives the places (N, 3) in that frame
+    from which they were measured, None if that is its pose. Both raise DatasetError, which names the file.
+    """
+
+    read_points: Callable[[Pose], NDArray[np.float64]]
     source: str
-    pose_source: str
     starts: Callable[[], NDArray[np.float64]] | None = None
 
 
 @dataclass
-class LidarScans(LidarRecording):
+class LidarScans(LidarRecording, Table[RecordedScan]):
     """Scans of free rays. ``camera`` and ``reach_m`` are those of the first scan that can be read."""
 
-    scans: Sequence[RecordedScan] = field(kw_only=True)
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The names of the scans in order."""
-        return [scan.name for scan in self.scans]
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [scan.stamp for scan in self.scans]
-
-    def read(self, index: int) -> Frame:
-        """Read one scan.
-
-        Raises FrameError, which names the frame and the file, if its points are missing, damaged or none, or
-        if its pose is invalid. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.scans):
-            raise IndexError(f"{self.name} has {len(self.scans)} frames, there is no frame {index}")
-        scan = self.scans[index]
-        table, range_m, T_world_sensor = read_scan(scan)
-        return Frame(range_m, T_world_sensor, table, scan.stamp, scan.name)
-
-
-def read_scan(scan: RecordedScan) -> tuple[RayTable, NDArray[np.float32], Pose]:
-    """The rays of a scan's measured points, of which there is one, their ranges (1, N), and T_world_sensor.
-    Raises FrameError, which names frame and file."""
-    try:
-        points_m, T_world_sensor = scan.read()
-        starts_m = np.zeros((1, 3)) if scan.starts is None else scan.starts()
-    except KeyframeError as error:
-        raise FrameError(f"frame {scan.name}: {scan.pose_source}: {error}") from error
-    except DatasetError as error:
-        raise FrameError(f"frame {scan.name}: {error}") from error
-    measured = measured_points(points_m - starts_m)
-    if not measured.any():
-        raise FrameError(f"frame {scan.name}: {scan.source}: none of {len(points_m)} points is a measurement")
-    if scan.starts is None:
-        return *RayTable.of_points(points_m[measured]), T_world_sensor
-    T_sensor_then = np.tile(np.eye(4), (int(measured.sum()), 1, 1))
-    T_sensor_then[:, :3, 3] = starts_m[measured]
-    return *RayTable.of_points((points_m - starts_m)[measured], T_sensor_then), T_world_sensor
+    def load(self, index: int, row: RecordedScan, T_world_camera: Pose) -> Frame:
+        """The rays of a scan's measured points, of which there must be one, and their ranges (1, N)."""
+        points_m = row.read_points(T_world_camera)
+        starts_m = np.zeros((1, 3)) if row.starts is None else row.starts()
+        measured = measured_points(points_m - starts_m)
+        if not measured.any():
+            raise DatasetError(f"{row.source}: none of {len(points_m)} points is a measurement")
+        if row.starts is None:
+            table, range_m = RayTable.of_points(points_m[measured])
+        else:
+            T_sensor_then = np.tile(np.eye(4), (int(measured.sum()), 1, 1))
+            T_sensor_then[:, :3, 3] = starts_m[measured]
+            table, range_m = RayTable.of_points((points_m - starts_m)[measured], T_sensor_then)
+        return Frame(range_m, T_world_camera, table, row.stamp, row.name)
 
 
 def measured_points(points_m: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -100,16 +69,9 @@ def lidar_scans(
     """The recording of these scans. Raises DatasetError if none can be read, which is the first one's error,
     and for options that only depth images have."""
     refuse_image_options(name, options)
-    problem: FrameError | None = None
-    for scan in scans:
-        try:
-            camera, range_m, _ = read_scan(scan)
-        except FrameError as error:
-            problem = problem or error
-            continue
-        reach_m = reach_of(range_m)
-        return LidarScans(name, camera, list(notes), dropped, scans=scans, reach_m=reach_m)
-    raise DatasetError(f"{name}: no scan can be read: {problem}") from problem
+    found = LidarScans(name, RayTable([[1.0, 0.0, 0.0]]), list(notes), dropped, rows=scans)
+    found.look_at_first("scan")
+    return found
 
 
 def refuse_image_options(name: str, options: ReadOptions) -> None:

@@ -15,7 +15,6 @@ from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import moved_note
 from taichi_mrf.datasets.pose_sources.base import PoseSource
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
-from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -197,6 +196,9 @@ def open_posed(
             source, track=track, max_time_gap=max_time_gap, poses_are=poses_are, mounting=mounting, **reading
         )
     conventions = conventions_of(poses_are, mounting, AXIAL)
+    # Imported late: no recording that brings its own poses needs it.
+    from taichi_mrf.datasets.pose_sources.registry import open_pose_source
+
     opened = open_pose_source(poses)
     keywords = {"max_time_gap": max_time_gap, **reading}
     has_poses = True

@@ -20,7 +20,7 @@ from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.realsense.motion import MotionModule, motion_or_note, recorded_motion
-from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording, aligned_images
+from taichi_mrf.datasets.realsense.recorded import Player, RealSenseFrame, RealSenseRecording, aligned_images
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -272,8 +272,10 @@ def _open_recording(
         notes=notes,
         dropped=dropped,
         player=player,
-        listed=[each for each, _ in posed],
-        poses=[pose for _, pose in posed],
+        rows=[
+            RealSenseFrame(f"realsense-{each.number:06d}", each.stamp, pose, str(path), each.number)
+            for each, pose in posed
+        ],
         gyro=gyro,
         acceleration=acceleration,
     )

@@ -5,7 +5,7 @@ The file is played once when it is opened, for the numbers and stamps of its dep
 are read: a recording can only be played forwards, so frames are best read in their order.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.images import measured
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -106,46 +106,41 @@ class Player:
         self._pipeline = pipeline
 
 
+@dataclass(frozen=True)
+class RealSenseFrame(Row):
+    """A frame, and the number that the camera gave its image."""
+
+    number: int
+
+
 @dataclass
-class RealSenseRecording(Dataset):
-    """The depth images of a recording, ``listed`` with their ``poses``, and what its IMU measured."""
+class RealSenseRecording(Table[RealSenseFrame]):
+    """The depth images of a recording, and what its IMU measured."""
 
     player: Player = field(kw_only=True)
-    listed: Sequence[RecordedImage] = field(kw_only=True)
-    poses: Sequence[Pose] = field(kw_only=True)
     gyro: GyroSamples | None = field(kw_only=True, default=None)
     acceleration: AccelerationSamples | None = field(kw_only=True, default=None)
 
     def __post_init__(self) -> None:
-        self._names = [f"realsense-{each.number:06d}" for each in self.listed]
         self.player.rewind()
         self._coming = self.player.images()
         self._last = -1
         """The index of the frame that was read last; the player stands behind it."""
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The numbers that the camera gave its images."""
-        return self._names
-
-    def read(self, index: int) -> Frame:
-        """Play on to an image, from the beginning if it lies behind. Raises FrameError, which names the
-        frame, if it is missing or has another size; IndexError outside 0 to len - 1."""
-        if not 0 <= index < len(self.listed):
-            raise IndexError(f"{self.name} has {len(self.listed)} frames, there is no frame {index}")
-        name, wanted = self._names[index], self.listed[index]
+    def load(self, index: int, row: RealSenseFrame, T_world_camera: Pose) -> Frame:
+        """Play on to an image, from the beginning if it lies behind."""
         if index <= self._last:
             self.player.rewind()
             self._coming = self.player.images()
         self._last = index
-        images = next((images for found, images in self._coming if found.number == wanted.number), None)
+        images = next((images for found, images in self._coming if found.number == row.number), None)
         if images is None:
-            self._last = len(self.listed)  # the player is at the end
-            raise FrameError(f"frame {name}: {self.name}: the image is missing when the file is played again")
+            self._last = len(self)  # the player is at the end
+            raise DatasetError(f"{self.name}: the image is missing when the file is played again")
         image, color = images
         steps = np.asanyarray(image.get_data())
         if steps.shape != self.camera.shape:
-            raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
+            raise DatasetError(f"the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (measured(steps) * np.float32(self.player.depth_scale)).astype(np.float32)
-        parts = (self.poses[index], self.camera, wanted.stamp, name, color)
+        parts = (T_world_camera, self.camera, row.stamp, row.name, color)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.base import Dataset, Table, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
@@ -31,7 +31,7 @@ from taichi_mrf.datasets.ros.imu import BagImu, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import PoseChoice
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
@@ -42,7 +42,7 @@ from taichi_mrf.datasets.ros.topics import (
     no_depth,
     packed_otherwise,
 )
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -90,58 +90,26 @@ class BagOptions(PoseChoice):
 
 
 @dataclass
-class RosBag(Dataset):
-    """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are.
-    ``cameras`` took them; ``camera`` is the first."""
+class RosBag(Table[BagRow]):
+    """The depth images of one topic, each with its pose. ``cameras`` took them; ``camera`` is the first."""
 
     camera: PinholeCamera
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
-    entries: Sequence[Entry] = field(kw_only=True)
-    poses: Sequence[Pose] = field(kw_only=True)
-    names: Sequence[str] = field(kw_only=True)
     cameras: BagCameras = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
-    confidence: BagConfidence | None = None
+    confidences: BagConfidence | None = None
     gyro: GyroSamples | None = None
     acceleration: AccelerationSamples | None = None
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return None if self.confidence is None else L515.sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return super().sigma_origin if self.confidence is None else L515.origin
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether there are images of confidence."""
-        return self.confidence is not None
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The number that each image has in its topic, or the run that is read, from 0."""
-        return self.names
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [entry.stamp for entry in self.entries]
-
-    def pose(self, index: int) -> Pose:
-        """The pose of one frame."""
-        return self.poses[index]
 
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
         metres."""
         shares, depths = [], []
-        for entry in self.entries[:: -(-len(self.entries) // _LOOKED_AT)]:
+        for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
             try:
-                message = self.reader.read(self.topic, entry)
+                message = self.reader.read(self.topic, row.entry)
                 shares.append(messages.share_without(message))
                 depths.append(messages.depth_image(message, None))
             except DatasetError:  # reported when its frame is read
@@ -153,13 +121,14 @@ class RosBag(Dataset):
     def look_at_axes(self, frame: str) -> None:
         """Take the poses for those of a body's axes, x ahead and z up, if neighbouring images agree clearly
         better so: names such as camera_link are used for both."""
-        turned = [pose_of(T, Conventions(axes="ros")) for T in self.poses]
+        recorded = [self.pose(index) for index in range(len(self.rows))]
+        turned = [pose_of(T, Conventions(axes="ros")) for T in recorded]
         found = [
             gather(len(poses), poses.__getitem__, self._metres, self.camera, (1.0,)).disagreement
-            for poses in (self.poses, turned)
+            for poses in (recorded, turned)
         ]
         if all(found) and found[1][1.0] < min(_AGREE, 0.5 * found[0][1.0]):
-            self.poses = turned
+            self.rows = [replace(row, pose=T) for row, T in zip(self.rows, turned, strict=True)]
             self.notes.append(
                 f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
                 f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
@@ -167,41 +136,29 @@ class RosBag(Dataset):
             )
 
     def _metres(self, index: int) -> NDArray[np.float32]:
-        return messages.depth_image(self.reader.read(self.topic, self.entries[index]), self.depth_scale)
+        message = self.reader.read(self.topic, self.rows[index].entry)
+        return messages.depth_image(message, self.depth_scale)
 
-    def read(self, index: int) -> Frame:
-        """Decode one image.
-
-        Raises FrameError, which names frame, file and topic, if it is damaged, of another encoding, or of
-        another size than the camera's. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.entries):
-            raise IndexError(f"{self.name} has {len(self.entries)} frames, there is no frame {index}")
-        name, where = self.names[index], f"{self.reader.path}: topic {self.topic}"
-        try:
-            message = self.reader.read(self.topic, self.entries[index])
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
+    def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
+        """Decode one image, which must have its camera's size."""
+        where = f"{self.reader.path}: topic {self.topic}"
+        message = self.reader.read(self.topic, row.entry)
         try:
             depth_m = messages.depth_image(message, self.depth_scale)
         except DatasetError as error:
-            raise FrameError(f"frame {name}: {where}: {error}") from error
-        stamp = self.entries[index].stamp
-        camera = self.cameras.at(self.entries[index], depth_m.shape)
+            raise DatasetError(f"{where}: {error}") from error
+        camera = self.cameras.at(row.entry, depth_m.shape)
         if depth_m.shape != camera.shape:
-            raise FrameError(
-                f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
+            raise DatasetError(
+                f"{where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
                 f"the camera {camera.width} x {camera.height}"
             )
         color = sigma_m = None
-        try:
-            if self.colors is not None:
-                color = self.colors.read(index, depth_m, camera)
-            if self.confidence is not None:
-                sigma_m = self.confidence.read(index, depth_m, camera)
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
-        parts = (self.poses[index], camera, stamp, name, color, sigma_m)
+        if self.colors is not None:
+            color = self.colors.read(index, depth_m, camera)
+        if self.confidences is not None:
+            sigma_m = self.confidences.read(index, depth_m, camera)
+        parts = (T_world_camera, camera, row.stamp, row.name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
@@ -256,10 +213,9 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     confidence, said = find_confidence(reader, chosen.confidence, *parts)
     notes += said + cameras.notes
     tracked, imu = chosen.poses == TRACK, BagImu()
-    poses = [pose for _, _, pose in posed]
     if tracked:
         imu = find_imu(reader, chosen.imu, sensor, stamps[0])
-        poses = [start_pose(imu.up)] * len(posed)
+        posed = [(i, entry, start_pose(imu.up)) for i, entry, _ in posed]
         notes += imu.notes
     bag = RosBag(
         name=reader.path.stem,
@@ -270,13 +226,12 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         distortion=cameras.distortion,
         reader=reader,
         topic=depth.name,
-        entries=[entry for _, entry, _ in posed],
-        poses=poses,
-        names=[f"{i:06d}" for i, _, _ in posed],
+        rows=_rows(reader, posed),
         depth_scale=options.depth_scale,
         tracked=tracked,
         colors=colors,
-        confidence=confidence,
+        confidence=None if confidence is None else L515,
+        confidences=confidence,
         gyro=imu.gyro,
         acceleration=imu.acceleration,
     )
@@ -307,15 +262,18 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
         dropped=len(sensor.entries) - len(posed),
         reader=reader,
         topic=topic,
-        entries=[entry for _, entry, _ in posed],
-        poses=[pose for _, _, pose in posed],
-        names=[f"{i:06d}" for i, _, _ in posed],
+        rows=_rows(reader, posed),
         at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
         registered=registered,
         tracked=tracked,
     )
     bag.look_at_first()
     return bag
+
+
+def _rows(reader: RosReader, posed: Sequence[tuple[int, Entry, Pose]]) -> list[BagRow]:
+    """Frames are named by the number of their message in its topic, or in the run that is read, from 0."""
+    return [BagRow(f"{i:06d}", entry.stamp, pose, f"{reader.path}", entry) for i, entry, pose in posed]
 
 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:

@@ -5,96 +5,62 @@ whose pixels without a return are known; any other becomes free rays. Where each
 lidar moved meanwhile, each ray starts where the lidar was at that time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import Table
 from taichi_mrf.datasets.lidar.motion import Motion, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
-from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
+from taichi_mrf.datasets.lidar.recording import LidarRecording
 from taichi_mrf.datasets.lidar.scans import measured_points
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.datasets.ros.reader import BagRow, RosReader
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
 
 @dataclass
-class LidarBag(LidarRecording):
+class LidarBag(LidarRecording, Table[BagRow]):
     """The point clouds of one topic, each with its pose. ``at`` gives the pose of the lidar of a frame at a
     time in seconds, or None; if it is None itself, points are left where they are. ``registered`` points are
     in the world's frame, and are taken back into the lidar's."""
 
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
-    entries: Sequence[Entry] = field(kw_only=True)
-    poses: Sequence[Pose] = field(kw_only=True)
-    names: Sequence[str] = field(kw_only=True)
     at: Callable[[str, float], Pose | None] | None = None
     registered: bool = False
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The number that each cloud has in its topic, from 0."""
-        return self.names
-
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [entry.stamp for entry in self.entries]
-
-    def pose(self, index: int) -> Pose:
-        """The pose of one frame."""
-        return self.poses[index]
-
-    def read(self, index: int) -> Frame:
-        """Decode one cloud.
-
-        Raises FrameError, which names frame, file and topic, if it is damaged or has no measurement. Raises
-        IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.entries):
-            raise IndexError(f"{self.name} has {len(self.entries)} frames, there is no frame {index}")
-        name, where, entry = self.names[index], f"{self.reader.path}: topic {self.topic}", self.entries[index]
-        try:
-            message = self.reader.read(self.topic, entry)
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
+    def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
+        """Decode one cloud, which must have a measurement."""
+        message, entry = self.reader.read(self.topic, row.entry), row.entry
         try:
             cloud = decode(message, entry.stamp)
+            measured = measured_points(cloud.points_m)
+            if not measured.any():
+                raise DatasetError(f"none of {measured.size} points is a measurement")
         except DatasetError as error:
-            raise FrameError(f"frame {name}: {where}: {error}") from error
-        measured = measured_points(cloud.points_m)
-        if not measured.any():
-            raise FrameError(f"frame {name}: {where}: none of {measured.size} points is a measurement")
-        pose = self.poses[index]
+            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
+        pose = T_world_camera
         if self.registered:
             own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
             cloud = replace(cloud, points_m=own.astype(cloud.points_m.dtype))
         motion = None if self.at is None else Motion(entry.stamp, pose, partial(self.at, entry.frame))
         scan = _image(cloud, motion) or _free(cloud, motion)
-        return Frame(scan.range_m, pose, scan.camera, entry.stamp, name, no_return=scan.no_return)
+        return Frame(scan.range_m, pose, scan.camera, entry.stamp, row.name, no_return=scan.no_return)
 
-    def look_at_first(self) -> None:
-        """Set camera, reach and notes from the first cloud that can be read. Raises DatasetError, which says
-        why the first cannot, if none can."""
-        problem: FrameError | None = None
-        for index in range(len(self.entries)):
-            try:
-                frame = self.read(index)
-            except FrameError as error:
-                problem = problem or error
-                continue
-            self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
-            pattern = isinstance(frame.camera, RayTable) and frame.camera.has_pattern
-            rays = f"images of {frame.camera.width} x {frame.camera.height} rays" if pattern else "free rays"
-            self.notes.append(f"{self.topic}: {rays}")
-            return
-        raise DatasetError(f"{self.name}: no cloud can be read: {problem}") from problem
+    def look_at_first(self, what: str = "cloud") -> None:
+        """Set camera, reach and a note from the first cloud that can be read. Raises DatasetError as for any
+        lidar."""
+        super().look_at_first(what)
+        pattern = isinstance(self.camera, RayTable) and self.camera.has_pattern
+        rays = f"images of {self.camera.width} x {self.camera.height} rays" if pattern else "free rays"
+        self.notes.append(f"{self.topic}: {rays}")
 
 
 def _image(cloud: Cloud, motion: Motion | None) -> Scan | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.file_order import Place, places_of
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
@@ -52,6 +53,13 @@ class Entry:
 
     place: int = 0
     """Grows in the order of recording: its time, or the place in the file if that time starts again."""
+
+
+@dataclass(frozen=True)
+class BagRow(Row):
+    """A frame of a bag, and where its message is."""
+
+    entry: Entry
 
 
 class RosReader:

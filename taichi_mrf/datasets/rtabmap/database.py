@@ -27,8 +27,6 @@ from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.system.files import check_regular
 
-SUFFIX = ".db"
-
 LOOP_CLOSURES = (1, 2, 3, 4)
 """Types of links that close a loop: by appearance, near in space, near in time, by a user."""
 

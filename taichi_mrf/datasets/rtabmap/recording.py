@@ -6,14 +6,13 @@ RTAB-Map 0.11 to 0.23 define them.
 """
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.base import Row, Table, start_pose
 from taichi_mrf.datasets.color_camera import without_black
 from taichi_mrf.datasets.images import decode_color, decode_unchanged, note_of_largest, share_of_largest
 from taichi_mrf.datasets.options import ReadOptions
@@ -22,79 +21,64 @@ from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.rtabmap.calibration import NodeCamera, node_camera
 from taichi_mrf.datasets.rtabmap.database import LOOP_CLOSURES, Node, RtabmapDatabase
 from taichi_mrf.datasets.rtabmap.depth import decode_depth, depth_size
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
-NAME = "RTAB-Map"
 STEPS_PER_METRE = 1000.0
 _LOOKED_AT = 4
 """Images whose numbers are looked at when a database is opened."""
 
 
 @dataclass(frozen=True)
-class PosedNode:
-    """A node with its camera and T_world_camera (4, 4)."""
+class PosedNode(Row):
+    """A node with its camera."""
 
+    pose: Pose
     node: Node
     camera: NodeCamera
-    T_world_camera: Pose
 
 
 @dataclass
-class RtabmapRecording(Dataset):
+class RtabmapRecording(Table[PosedNode]):
     """The nodes of a database that have depth and a pose."""
 
     camera: PinholeCamera
     database: RtabmapDatabase = field(kw_only=True)
-    nodes: Sequence[PosedNode] = field(kw_only=True)
     own_cameras: bool = True
     """Each node has the camera that is stored with it, not one that the caller named."""
 
     steps_per_metre: float = STEPS_PER_METRE
     color: bool = True
 
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The numbers of the nodes."""
-        return [f"{each.node.id:06d}" for each in self.nodes]
-
-    def stamps(self) -> Sequence[float]:
-        """When each node was made, in seconds."""
-        return [each.node.stamp for each in self.nodes]
-
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """A note of whole numbers that are no measurements; the unit is known."""
         shares = []
-        for each in self.nodes[:: -(-len(self.nodes) // _LOOKED_AT)]:
+        for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
             try:
-                depth, _ = self.database.images(each.node.id, color=False)
-                shares.append(share_of_largest(decode_unchanged(depth, NAME)))
+                depth, _ = self.database.images(row.node.id, color=False)
+                shares.append(share_of_largest(decode_unchanged(depth, row.pose_source)))
             except DatasetError:  # of another kind than PNG, or reported when its frame is read
                 continue
         return note_of_largest(shares)
 
-    def read(self, index: int) -> Frame:
-        """Decode a node's images. Raises FrameError, which names the node and the file, if they are damaged;
-        IndexError outside 0 to len - 1."""
-        if not 0 <= index < len(self.nodes):
-            raise IndexError(f"{self.name} has {len(self.nodes)} frames, there is no frame {index}")
-        each, name = self.nodes[index], self.frame_names[index]
-        where = f"{self.database.path}: node {each.node.id}"
+    def load(self, index: int, row: PosedNode, T_world_camera: Pose) -> Frame:
+        """Decode a node's images."""
+        where = f"{self.database.path}: node {row.node.id}"
+        depth, image = self.database.images(row.node.id, self.color)
+        depth_m = decode_depth(depth, f"{where}: depth", self.steps_per_metre)
+        height, width = depth_m.shape
         try:
-            depth, image = self.database.images(each.node.id, self.color)
-            depth_m = decode_depth(depth, f"{where}: depth", self.steps_per_metre)
-            height, width = depth_m.shape
-            camera = each.camera.of_images(width, height) if self.own_cameras else self.camera
-            if depth_m.shape != camera.shape:
-                raise DatasetError(
-                    f"{where}: depth is {width} x {height}, the camera {camera.width} x {camera.height}"
-                )
-            color = None if image is None else _thinned(decode_color(image, f"{where}: image"), camera)
-        except (DatasetError, ConfigError) as error:
-            raise FrameError(f"frame {name}: {error}") from error
-        return Frame(depth_m, each.T_world_camera, camera, each.node.stamp, name, color)
+            camera = row.camera.of_images(width, height) if self.own_cameras else self.camera
+        except ConfigError as error:
+            raise DatasetError(str(error)) from error
+        if depth_m.shape != camera.shape:
+            raise DatasetError(
+                f"{where}: depth is {width} x {height}, the camera {camera.width} x {camera.height}"
+            )
+        color = None if image is None else _thinned(decode_color(image, f"{where}: image"), camera)
+        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, color)
 
 
 def _thinned(color: NDArray[np.uint8], camera: PinholeCamera) -> NDArray[np.uint8]:
@@ -125,7 +109,7 @@ def open_database(path: Path, options: ReadOptions) -> RtabmapRecording:
         dropped=dropped,
         distortion=nodes[0].camera.distortion,
         database=database,
-        nodes=nodes,
+        rows=nodes,
         own_cameras=options.camera is None and options.intrinsics is None,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         color=options.color,
@@ -147,7 +131,9 @@ def _posed_nodes(database: RtabmapDatabase, track: bool = False) -> tuple[list[P
             continue
         camera = node_camera(blob, version, f"{database.path}: node {id}")
         T_world_camera = T_world_body if track else T_world_body @ camera.T_body_camera
-        found.append(PosedNode(node, camera, T_world_camera))
+        found.append(
+            PosedNode(f"{id:06d}", node.stamp, T_world_camera, f"{database.path}: node {id}", node, camera)
+        )
     if optimised and not track:
         return found, without, ["poses as RTAB-Map last optimised them"]
     notes = [] if track else ["poses of the odometry: the database holds no optimised ones"]
@@ -171,7 +157,7 @@ def changing_poses(path: Path) -> ChangedPoses:
         nodes, _, _ = _posed_nodes(database)
     finally:
         database.close()
-    return {each.node.stamp: each.T_world_camera for each in nodes}
+    return {each.stamp: each.pose for each in nodes}
 
 
 def open_poses(path: Path, query: str) -> PoseSource:

@@ -52,15 +52,15 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     ):
         if count != len(names):
             raise DatasetError(f"{path}: contains {count} {what} for {len(names)} stereo pairs")
-    pairs = [
-        RecordedPair(folder / left / name, folder / right / name, stamp, pose)
-        for name, stamp, pose in zip(names, stamps, poses.poses, strict=True)
-    ]
+    pairs = []
+    for name, stamp, pose in zip(names, stamps, poses.poses, strict=True):
+        images = folder / left / name, folder / right / name
+        pairs.append(RecordedPair(images[0].stem, stamp, pose.T_world_camera, pose.source, *images))
     return StereoPairs(
         name=folder.name,
         camera=rig.camera,
         notes=[noise_note(rig, left, right), *stamp_notes],
-        pairs=pairs,
+        rows=pairs,
         baseline_m=rig.baseline_m,
         color=options.color,
     )

@@ -3,19 +3,18 @@
 Depth is not recorded: it is matched when a frame is read, and so is the sigma of each pixel.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.images import image_size, read_color
 from taichi_mrf.datasets.stereo.confidence import disparity_sigma
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoRig, stereo_depth
-from taichi_mrf.datasets.trajectories import RecordedPose
-from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -23,32 +22,24 @@ from taichi_mrf.system.files import read_text
 
 
 @dataclass(frozen=True)
-class RecordedPair:
-    """Where one pair's images are, its stamp in seconds and its pose as it was written."""
+class RecordedPair(Row):
+    """Where one pair's images are."""
 
     left_file: Path
     right_file: Path
-    stamp: float
-    pose: RecordedPose
 
 
 @dataclass
-class StereoPairs(Dataset):
+class StereoPairs(Table[RecordedPair]):
     """Stereo pairs as depth frames of the left camera; ``color`` is the left image.
 
     ``matching`` may be set to other parameters before frames are read.
     """
 
     camera: PinholeCamera
-    pairs: Sequence[RecordedPair] = ()
     baseline_m: float = 1.0
     color: bool = True
     matching: StereoMatching = field(default_factory=StereoMatching)
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The images' names without their endings."""
-        return [pair.left_file.stem for pair in self.pairs]
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:
@@ -65,33 +56,9 @@ class StereoPairs(Dataset):
         """The left camera and the baseline."""
         return StereoRig(self.camera, self.baseline_m)
 
-    def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
-        return [pair.stamp for pair in self.pairs]
-
-    def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises FrameError, which names the frame and the file."""
-        pair = self.pairs[index]
-        try:
-            return pair.pose.T_world_camera()
-        except KeyframeError as error:
-            raise FrameError(f"frame {pair.left_file.stem}: {pair.pose.source}: {error}") from error
-
-    def read(self, index: int) -> Frame:
-        """Read and match one pair.
-
-        Raises FrameError, which names the frame and the file, if an image is missing, damaged or of
-        another size than the camera's, or if the pose is invalid. Raises IndexError outside 0 to len - 1.
-        """
-        if not 0 <= index < len(self.pairs):
-            raise IndexError(f"{self.name} has {len(self.pairs)} frames, there is no frame {index}")
-        pair = self.pairs[index]
-        name = pair.left_file.stem
-        T_world_camera = self.pose(index)
-        try:
-            left, right = (read_color(path, self.camera) for path in (pair.left_file, pair.right_file))
-        except DatasetError as error:
-            raise FrameError(f"frame {name}: {error}") from error
+    def load(self, index: int, row: RecordedPair, T_world_camera: Pose) -> Frame:
+        """Read and match one pair, whose images must have the camera's size."""
+        left, right = (read_color(path, self.camera) for path in (row.left_file, row.right_file))
         grey_left, grey_right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
         depth_m = stereo_depth(grey_left, grey_right, self.rig, self.matching)
         sigma_m = None
@@ -99,7 +66,7 @@ class StereoPairs(Dataset):
             sigma_d_px = disparity_sigma(grey_left, grey_right, self.rig.disparity(depth_m))
             sigma_m = self.rig.sigma_at(depth_m, sigma_d_px)
         color = left if self.color else None
-        return Frame(depth_m, T_world_camera, self.camera, pair.stamp, name, color, sigma_m)
+        return Frame(depth_m, T_world_camera, self.camera, row.stamp, row.name, color, sigma_m)
 
 
 def noise_note(rig: StereoRig, left: str, right: str) -> str:

@@ -29,11 +29,11 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
-from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
+from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
-SUFFIXES = (".yaml", ".yml")
 SECONDS_PER_PAIR = 0.1
 _NANOSECOND_DIGITS = 16
 
@@ -91,7 +91,7 @@ def open_file(path: Path, options: ReadOptions) -> Dataset:
         camera=rig.camera,
         notes=[noise_note(rig, described.left, described.right), *notes],
         dropped=dropped,
-        pairs=pairs,
+        rows=pairs,
         baseline_m=rig.baseline_m,
         color=options.color,
         matching=described.matching,
@@ -177,7 +177,7 @@ def _pairs(
         stamps = [SECONDS_PER_PAIR * i for i in range(len(images))]
         notes.append(f"no stamps: assumed {SECONDS_PER_PAIR:g} s from one pair to the next")
     pairs = [
-        RecordedPair(left, right, stamp, pose)
+        RecordedPair(left.stem, stamp, pose.T_world_camera, pose.source, left, right)
         for (left, right), stamp, pose in zip(images, stamps, trajectory.poses, strict=True)
     ]
     return pairs, notes, 0
@@ -195,9 +195,7 @@ def _interpolated(
     for (left, right), stamp in zip(images, stamps, strict=True):
         pose = timed.at(stamp, gap)
         if pose is not None:
-            pairs.append(
-                RecordedPair(left, right, stamp, RecordedPose(stamp, np.array(pose), str(poses_file)))
-            )
+            pairs.append(RecordedPair(left.stem, stamp, as_pose(pose), str(poses_file), left, right))
     dropped = len(images) - len(pairs)
     if not pairs:
         raise DatasetError(

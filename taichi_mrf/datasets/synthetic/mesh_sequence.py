@@ -5,21 +5,18 @@ fields of :class:`MeshOptions` are the options. The mesh's frame is the world; t
 is in any layout that recordings use (trajectories.py). Paths are relative to the working folder.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.intrinsics import PRIMESENSE
-from taichi_mrf.datasets.options import ReadOptions, parse_options
+from taichi_mrf.datasets.base import Row, Table
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
-from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
+from taichi_mrf.datasets.trajectories import read_trajectory
+from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -83,42 +80,24 @@ class MeshOptions:
 
 
 @dataclass
-class MeshSequence(Dataset):
+class MeshSequence(Table[Row]):
     """A mesh as a sequence of frames, rendered on request, with ground truth."""
 
     camera: PinholeCamera
     scene: MeshScene = field(kw_only=True)
-    trajectory: Trajectory = field(kw_only=True)
     options: MeshOptions = field(kw_only=True)
-
-    @cached_property
-    def frame_names(self) -> Sequence[str]:
-        """The names of the frames in order, for reports."""
-        return [f"{self.name}-{index:04d}" for index in range(len(self.trajectory.poses))]
-
-    def pose(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4). Raises FrameError for an invalid pose."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} frames, there is no frame {index}")
-        recorded = self.trajectory.poses[index]
-        try:
-            return recorded.T_world_camera()
-        except KeyframeError as error:
-            raise FrameError(f"frame {self.frame_names[index]}: {recorded.source}: {error}") from error
 
     def clean_depth(self, index: int) -> NDArray[np.float32]:
         """True axial depth of a frame, (H, W) float32 in metres, 0 where the ray meets no triangle."""
         return self.scene.render_depth(self.camera, self.pose(index))
 
-    def read(self, index: int) -> Frame:
-        """Render one frame, with the noise that the options ask for. Raises FrameError as :meth:`pose`."""
+    def load(self, index: int, row: Row, T_world_camera: Pose) -> Frame:
+        """Render one frame, with the noise that the options ask for."""
         depth_m = self.clean_depth(index)
         if self.options.noise != "none":
             sensor = SENSORS[self.options.noise]
             depth_m = simulate(depth_m, self.camera, sensor, seed=(self.options.seed, index))
-        stamped = self.trajectory.layout == "stamped"
-        stamp = self.trajectory.poses[index].key if stamped else float(index)
-        return Frame(depth_m, self.pose(index), self.camera, stamp, self.frame_names[index])
+        return Frame(depth_m, T_world_camera, self.camera, row.stamp, row.name)
 
 
 def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
@@ -137,10 +116,9 @@ def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
     chosen = parse_options(MeshOptions, query, name)
     scene = MeshScene(load_mesh(Path(file)))
     trajectory = read_trajectory(Path(chosen.poses))
-    return MeshSequence(
-        Path(file).stem,
-        options.camera or chosen.camera(),
-        scene=scene,
-        trajectory=trajectory,
-        options=chosen,
-    )
+    stem, stamped = Path(file).stem, trajectory.layout == "stamped"
+    rows = [
+        Row(f"{stem}-{i:04d}", pose.key if stamped else float(i), pose.T_world_camera, pose.source)
+        for i, pose in enumerate(trajectory.poses)
+    ]
+    return MeshSequence(stem, options.camera or chosen.camera(), rows=rows, scene=scene, options=chosen)

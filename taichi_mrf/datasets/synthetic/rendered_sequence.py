@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.intrinsics import PRIMESENSE
+from taichi_mrf.datasets.options import PRIMESENSE
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.texture import mottled
 from taichi_mrf.errors import BackendError, ConfigError
