@@ -17,7 +17,7 @@ from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.map_file import MapHeader
-from taichi_mrf.methods.recursive_storage import RecursiveContents, write_recursive
+from taichi_mrf.methods.recursive import RecursiveContents, write_recursive
 from taichi_mrf.system.libraries import library
 
 

@@ -2,8 +2,8 @@
 
 viser trusts its clients: any of them may write any property of any widget, upload files and open a public
 tunnel. Here a message passes only if it is about something that exists, is shown and can be used, and its
-values are ones that the widget could have sent. The value that a widget takes is of its own type, in its range,
-on its grid.
+values are ones that the widget could have sent. The value that a widget takes is of its own type, in its
+range, on its grid.
 """
 
 import math
