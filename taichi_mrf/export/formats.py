@@ -22,8 +22,7 @@ from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.fused_surface import SurfacedMap, has_surface, measured_surface
-from taichi_mrf.export.level_map import level_map
-from taichi_mrf.export.map_server import grey_image, write_map_server
+from taichi_mrf.export.map_server import grey_image, level_map, write_map_server
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels

@@ -40,8 +40,8 @@ from taichi_mrf.methods.map_file import (
     read_bricks,
     read_header,
 )
+from taichi_mrf.methods.protocol import MapStatistics, measure
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS, fade_bricks
-from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma

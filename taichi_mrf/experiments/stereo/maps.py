@@ -22,10 +22,13 @@ from taichi_mrf.experiments.stereo.artefact_curve import (
     curve_figure,
     threshold_for,
 )
-from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, growth_figure, growth_rows
-from taichi_mrf.experiments.stereo.scaling import (
+from taichi_mrf.experiments.stereo.growth import (
     OCTOMAP,
     STRIDES,
+    corridor_scene,
+    grow,
+    growth_figure,
+    growth_rows,
     measured_methods,
     scaling_figure,
     time_mapping,
