@@ -1,22 +1,16 @@
 """Profile of a new keyframe: every kernel by Taichi's own profiler, and the host by Python's.
 
 Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
-so many kernels, launches are timed instead, which has a launch's own cost in it. Profiling slows the host
-down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
-
-Kernel launches are watched from outside: how often the host waits for the device, and how long each takes. On
-a device with a memory of its own, the launch of a kernel that is handed a NumPy array waits until that has
-been copied there and back; reading an array back is such a launch too. On a CPU no copy is needed.
+so many kernels, launches are timed instead (launches.py), which has a launch's own cost in it. Profiling
+slows the host down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
 """
 
 import cProfile
 import pstats
 import re
-import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,47 +20,10 @@ import taichi_mrf
 from taichi_mrf import Config, Frame, MRFMap
 from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
+from taichi_mrf.benchmark.launches import count_launches
 from taichi_mrf.kernels import quick_start
 from taichi_mrf.system import compiler, runtime
 from taichi_mrf.system.compiler import ti
-
-
-@dataclass
-class Launches:
-    """``number`` of launches, and those that the host has to ``wait`` for, because a NumPy array goes in or
-    comes out; ``seconds`` of each launch by the kernel's name, if they are timed."""
-
-    number: int = 0
-    waits: int = 0
-    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-
-
-@contextmanager
-def count_launches(timed: bool = False) -> Iterator[Launches]:
-    """Watch all launches while the block runs. ``timed`` waits for each kernel, so as to time it."""
-    launches = Launches()
-    kernels = compiler.kernel_class()
-    launch = kernels.launch_kernel
-    apart = runtime.active() != "cpu"
-
-    def watched(self: Any, *arguments: Any, **named: Any) -> Any:
-        launches.number += 1
-        launches.waits += apart and any(isinstance(argument, np.ndarray) for argument in arguments)
-        if not timed:
-            return launch(self, *arguments, **named)
-        ti.sync()
-        begin = time.perf_counter()
-        result = launch(self, *arguments, **named)
-        ti.sync()
-        launches.seconds[self.func.__name__].append(time.perf_counter() - begin)
-        return result
-
-    kernels.launch_kernel = watched
-    try:
-        yield launches
-    finally:
-        kernels.launch_kernel = launch
-
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)
