@@ -28,14 +28,6 @@ from taichi_mrf.viewer.tune.noise_plot import NoisePlot
 from taichi_mrf.viewer.tune.score_board import score_board_html
 from taichi_mrf.viewer.tune.scores import KINDS
 
-LEAST_DECADE = 1e-300
-"""Shown in place of 0 by a slider of powers of ten."""
-MOST_ROWS = 150
-
-_TABLE_COLUMNS = ("accuracy_sigma", "median_abs_m", "log_likelihood", "depth_calibration", "seconds")
-_TABLE_HEADS = ("1.5 σ", "median", "log-lik.", "calib.", "time")
-_TABLE_MARKS = {"search": "◆", "hand": "", "start": ""}
-
 
 class Action(Enum):
     """A button, or a widget whose value asks the tuning process for something."""
@@ -75,6 +67,16 @@ _FOLDERS = {"map": "Map", **_OWN, "keyframes": "Keyframes"}
 _FOLDED = ("keyframes",)
 _MOST_TRIES = 200
 """Of the latest tries, how many the dropdown offers."""
+
+LEAST_DECADE = 1e-300
+"""Shown in place of 0 by a slider of powers of ten."""
+
+MOST_ROWS = 150
+"""Of the table of tries."""
+
+_TABLE_COLUMNS = ("accuracy_sigma", "median_abs_m", "log_likelihood", "depth_calibration", "seconds")
+_TABLE_HEADS = ("1.5 σ", "median", "log-lik.", "calib.", "time")
+_TABLE_MARKS = {"search": "◆", "hand": "", "start": ""}
 
 
 class TunePanel(BasePanel):
