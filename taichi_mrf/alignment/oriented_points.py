@@ -36,6 +36,7 @@ LEAST_SHARE = 0.6
 
 STEEPEST = 0.2
 """Cosine of the largest incidence (78 degrees) at which a measurement still locates a surface."""
+
 REACH = 2
 """Cells of the grid to each side whose rays count. A cell holds a ray of a few."""
 

@@ -21,6 +21,7 @@ from taichi_mrf.system import runtime
 
 IN_PLACE = 0.01
 """A keyframe whose points would move by less than this share of a voxel stays where it is."""
+
 STRIDE = 4
 """One pixel in so many, along both axes, is compared."""
 

@@ -21,6 +21,7 @@ from taichi_mrf.system.files import read_text
 
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
+
 SUFFIXES = (*board_images.FORMATS, *depth_files.FORMATS)
 """Ends of a file's name that are no part of the image's."""
 

@@ -40,6 +40,7 @@ from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS
 
 CANNOT_BE_MAPPED = 2
 """Exit status for a recording that ``map`` refuses."""
+
 Facts = dict[str, Any]
 
 

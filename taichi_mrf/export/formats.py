@@ -45,6 +45,7 @@ NO_SURFACE = (
     "anew with --keep-surface, or export from the map.npz of a run"
 )
 """Error for a missing measured surface, and its remedy."""
+
 _BYTES_PER_VOXEL = 40
 
 

@@ -42,6 +42,7 @@ PINHOLE_FORMAT = 2
 
 READABLE = (1, 2, 3)
 """The formats that can be read."""
+
 NUMBERS = "keyframe_camera_numbers"
 """Files with cameras that are no pinholes have this member."""
 

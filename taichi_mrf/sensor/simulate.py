@@ -20,6 +20,7 @@ Seed = int | Sequence[int]
 
 STEEP = 2.0
 """theta / (pi/2 - theta) at 60 degrees, the incidence theta from which axial noise grows with it."""
+
 Image = NDArray[np.float64]
 
 

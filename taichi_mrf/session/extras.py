@@ -39,6 +39,7 @@ COLOR_SHARE = 0.1
 
 ASK_SECONDS = 0.05
 """Shortest time between two looks at requests during long work, in seconds."""
+
 LEAST_LOG_ODDS = 0.0
 """Bricks without any voxel more likely occupied than not are not sent: in this map every brick that a ray
 crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free never falls below 0.12."""

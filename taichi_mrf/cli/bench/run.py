@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None"]
 """Measurements: tables to print, figures to write, and what draws them, if they can be drawn."""
+
 _QUERY_NAMES = {"balls": "balls, by clearance", "rays": "rays, to what is occupied"}
 """Of the rates, those that are called otherwise here."""
 

@@ -35,6 +35,7 @@ CORRIDOR_WALLS_M = ((-1.13, 1.27), (-1.38, 1.12))
 CORRIDOR_CAMERA = PinholeCamera(320, 240, 270.0, 270.0, 159.5, 119.5)
 PAPER_M, PAPER_UPDATES = 10.0, 65
 """At 0.2 m voxels the paper's map reaches about 10 m after 65 updates."""
+
 STRIDES: Mapping[int, str] = {1: "full", 2: "half", 4: "quarter"}
 OCTOMAP = "OctoMap itself"
 

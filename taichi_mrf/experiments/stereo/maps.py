@@ -67,6 +67,7 @@ SCALING_SIZES = (0.1, 0.2, 0.4)
 SCALING_VIEWS = 3
 COVERAGES = (0.9, 0.8, 0.7, 0.6)
 """Coverages at which maps are compared."""
+
 PLAN_HEIGHTS_M = (-2.5, 4.0)
 """Range of the colours, metres above the first camera; a car carries its cameras at 1.7 m."""
 

@@ -22,6 +22,7 @@ _COUNTED = {
     "baseline": "of the baseline",
 }
 """Layers that are counted beside voxels or the surface, and their words."""
+
 _SEVERITY_COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
 _POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
     "info": "blue",

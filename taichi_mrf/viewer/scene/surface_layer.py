@@ -22,6 +22,7 @@ from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 _DARKEST = 0.62
 """Brightness of what the light does not reach."""
+
 _TO_FILM = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
 _FROM_FILM = np.array(
     [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]

@@ -25,6 +25,7 @@ PICTURES_AT_ONCE = 8
 
 MOST_PIXELS = 2560 * 1600
 """Of a picture; larger windows are scaled down."""
+
 PAGE_POLICY = (
     "default-src 'none'; script-src 'wasm-unsafe-eval' {scripts}; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:; "

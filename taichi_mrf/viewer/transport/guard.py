@@ -35,6 +35,7 @@ from taichi_mrf.viewer.transport.viser_internals import Widget
 
 SHORTEST_VECTOR = 1e-6
 """A direction or a quaternion with a smaller norm has no direction."""
+
 LONGEST_TEXT = 200
 """Characters of a text field; no widget of the pages needs more."""
 
