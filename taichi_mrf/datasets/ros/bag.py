@@ -32,7 +32,7 @@ from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import PoseChoice
 from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
-from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
+from taichi_mrf.datasets.ros.sensor import find_sensor, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
     choose,
@@ -42,6 +42,7 @@ from taichi_mrf.datasets.ros.topics import (
     no_depth,
     packed_otherwise,
 )
+from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
