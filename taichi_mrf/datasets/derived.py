@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, StatedSensor
 from taichi_mrf.errors import LostFrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
@@ -24,29 +24,9 @@ class Derived(Dataset):
         return self.source.endless
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
+    def stated(self) -> StatedSensor:
         """The source's."""
-        return self.source.recorded_sigma
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """As the source's."""
-        return self.source.states_pixel_sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """The source's."""
-        return self.source.sigma_origin
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The source's."""
-        return self.source.recorded_reach
-
-    @property
-    def recorded_pass_through(self) -> float | None:
-        """The source's."""
-        return self.source.recorded_pass_through
+        return self.source.stated
 
     @property
     def origin_m(self) -> NDArray[np.float64]:

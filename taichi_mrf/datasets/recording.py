@@ -3,14 +3,14 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table
+from taichi_mrf.datasets.base import Row, StatedSensor, Table
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
@@ -54,9 +54,9 @@ class Recording(Table[RecordedFrame]):
     color_camera: ColorCamera | None = None
 
     @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether frames have images of confidence."""
-        return any(frame.confidence_file is not None for frame in self.rows)
+    def stated(self) -> StatedSensor:
+        """What the confidence is relative to, which only some folders hold."""
+        return replace(super().stated, pixel_sigma=any(row.confidence_file is not None for row in self.rows))
 
     def load(self, index: int, row: RecordedFrame, T_world_camera: Pose) -> Frame:
         """Read the images of one frame, which must have the camera's size."""

@@ -26,7 +26,7 @@ import numpy as np
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.values import check_field, from_dict
-from taichi_mrf.datasets.base import Dataset, Row, Table
+from taichi_mrf.datasets.base import Dataset, Row, StatedSensor, Table
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -114,9 +114,9 @@ class SeveralSensors(Table[SensorFrame]):
     sensors: Sequence[RecordedSensor] = field(kw_only=True)
 
     @property
-    def recorded_reach(self) -> float | None:
-        """That of the sensor that reaches farthest."""
-        return max(sensor.range_m[1] for sensor in self.sensors)
+    def stated(self) -> StatedSensor:
+        """The reach of the sensor that reaches farthest."""
+        return StatedSensor(reach_m=max(sensor.range_m[1] for sensor in self.sensors))
 
     def sensor_of(self, index: int) -> str:
         """The name of the sensor that took a frame."""
@@ -194,8 +194,8 @@ def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions
     dataset = open_dataset(source, color=options.color, **keywords)
     if dataset.endless or dataset.tracked:
         raise DatasetError("only recordings with poses can be put together")
-    sigma = entry.sigma or dataset.recorded_sigma
-    most = entry.max_depth or dataset.recorded_reach or SensorConfig().max_depth
+    sigma = entry.sigma or dataset.stated.sigma
+    most = entry.max_depth or dataset.stated.reach_m or SensorConfig().max_depth
     T = as_pose(np.reshape(entry.T_poses_sensor, (-1, 4))) if entry.T_poses_sensor else np.eye(4)
     noise = None if sigma is None else PolynomialNoise(sigma, entry.bias)
     return RecordedSensor(name, dataset, noise, entry.sigma is not None, T, (entry.min_depth, most))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, StatedSensor
 from taichi_mrf.errors import DatasetError, FrameError
 
 LIDAR_SIGMA_M = 0.03
@@ -40,24 +40,14 @@ class LidarRecording(Dataset):
         raise DatasetError(f"{self.name}: no {what} can be read: {problem}") from problem
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """The same at every range."""
-        return (LIDAR_SIGMA_M,)
-
-    @property
-    def sigma_origin(self) -> str:
-        """It is assumed."""
-        return "assumed for a lidar"
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The largest range of the first scan, rounded up to tens of metres."""
-        return self.reach_m
-
-    @property
-    def recorded_pass_through(self) -> float | None:
-        """The same for all lidars."""
-        return LIDAR_PASS_THROUGH
+    def stated(self) -> StatedSensor:
+        """What is assumed for every lidar, and the largest range of the first scan."""
+        return StatedSensor(
+            (LIDAR_SIGMA_M,),
+            origin="assumed for a lidar",
+            reach_m=self.reach_m,
+            pass_through=LIDAR_PASS_THROUGH,
+        )
 
 
 def reach_of(range_m: NDArray[np.floating]) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import SensorConfig
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, StatedSensor
 from taichi_mrf.datasets.options import PRIMESENSE
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.texture import mottled
@@ -103,9 +103,9 @@ class RenderedSequence(Dataset):
         return [f"{place}-{index:04d}" for index in range(self.options.frames)]
 
     @property
-    def recorded_reach(self) -> float:
-        """That of a Kinect, however far the scene is."""
-        return SensorConfig().max_depth
+    def stated(self) -> StatedSensor:
+        """The reach of a Kinect, however far the scene is."""
+        return StatedSensor(reach_m=SensorConfig().max_depth)
 
     def pose(self, index: int) -> Pose:
         """T_world_camera of a frame, (4, 4). Raises IndexError if there is no such frame."""
