@@ -15,7 +15,7 @@ from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -74,10 +74,8 @@ class Recording(Table[RecordedFrame]):
     ) -> NDArray[np.float32]:
         """The sigma of each pixel, from an image of its confidence. Raises DatasetError."""
         levels = read_grey(path)
-        try:
+        with naming(path):
             return confidence.sigma_m(levels, depth_m, camera)
-        except DatasetError as error:
-            raise DatasetError(f"{path}: {error}") from error
 
     def _read_color(
         self, path: Path, depth_m: NDArray[np.float32], camera: PinholeCamera

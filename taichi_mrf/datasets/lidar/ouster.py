@@ -28,7 +28,7 @@ from taichi_mrf.datasets.timed_poses import (
     read_timed_poses,
     within_gap,
 )
-from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.errors import DatasetError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import check_regular
@@ -78,10 +78,8 @@ class OusterScans(LidarRecording, Table[RecordedColumns]):
 
     def load(self, index: int, row: RecordedColumns, T_world_camera: Pose) -> Frame:
         """Decode one scan, which must have a column."""
-        try:
+        with naming(self.path):
             columns = columns_of(self.source, row.number, self.sensor)
-        except DatasetError as error:
-            raise DatasetError(f"{self.path}: {error}") from error
         if columns is None:
             raise DatasetError(f"{self.path}: it has no column")
         at = _poses(columns, self.trajectory, self.gap)
@@ -223,10 +221,8 @@ def _beams(path: Path, source: Any, sensor: int) -> Beams:
     infos = list(source.sensor_info)
     if not 0 <= sensor < len(infos):
         raise DatasetError(f"{path}: has {len(infos)} sensors, so there is no sensor {sensor}")
-    try:
+    with naming(f"{path}: sensor {sensor}"):
         return Beams.of(infos[sensor])
-    except DatasetError as error:
-        raise DatasetError(f"{path}: sensor {sensor}: {error}") from error
 
 
 def _of_sensor(frames: Any, sensor: int) -> Any | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.lidar.lzf import LARGEST_RATIO, unpack
 from taichi_mrf.datasets.lidar.text_columns import text_columns
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import open_regular, read_bytes
 from taichi_mrf.system.memory import check_memory
@@ -58,10 +58,8 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], Pose]:
     """
     data = read_bytes(path, DatasetError)
     header = _header(path, data[:_LONGEST_HEADER])
-    try:
+    with naming(f"{path}: VIEWPOINT", KeyframeError):
         T_world_sensor = header.T_world_sensor()
-    except KeyframeError as error:
-        raise DatasetError(f"{path}: VIEWPOINT: {error}") from error
     missing = [axis for axis in "xyz" if axis not in (header.dtype.names or ())]
     if missing:
         raise DatasetError(f"{path}: FIELDS has no {', '.join(missing)}")
@@ -165,10 +163,8 @@ def _compressed(path: Path, header: PcdHeader, body: memoryview) -> NDArray[np.f
             f"{path}: claims to unpack {packed} bytes to {unpacked}; {header.points} points take {needed}"
         )
     check_memory(needed, f"{path}")
-    try:
+    with naming(f"{path}: its packed points are damaged", ValueError):
         data = unpack(bytes(body[8 : 8 + packed]), needed)
-    except ValueError as error:
-        raise DatasetError(f"{path}: its packed points are damaged: {error}") from error
     columns, start = {}, 0
     for name in header.dtype.names or ():
         kind = header.dtype[name]

@@ -43,7 +43,7 @@ from taichi_mrf.datasets.ros.topics import (
     packed_otherwise,
 )
 from taichi_mrf.datasets.timed_poses import largest_gap
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -144,10 +144,8 @@ class RosBag(Table[BagRow]):
         """Decode one image, which must have its camera's size."""
         where = f"{self.reader.path}: topic {self.topic}"
         message = self.reader.read(self.topic, row.entry)
-        try:
+        with naming(where):
             depth_m = messages.depth_image(message, self.depth_scale)
-        except DatasetError as error:
-            raise DatasetError(f"{where}: {error}") from error
         camera = self.cameras.at(row.entry, depth_m.shape)
         if depth_m.shape != camera.shape:
             raise DatasetError(
@@ -285,8 +283,6 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     what = f"topics of depth images ({messages.ENCODINGS})"
     name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)
-    try:
+    with naming(f"{reader.path}: topic {name}"):
         messages.check_depth(topic.encoding)
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     return topic

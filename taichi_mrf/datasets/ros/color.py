@@ -15,7 +15,7 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 COLOR_GAP = 0.035
@@ -42,10 +42,8 @@ class BagColors:
         if entry is None:
             return None
         message = self.reader.read(self.topic, entry)
-        try:
+        with naming(f"{self.reader.path}: topic {self.topic}"):
             color = messages.color_image(message)
-        except DatasetError as error:
-            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
         own = depth_camera if self.camera is None else self.camera.camera
         if color.shape[:2] != own.shape:
             raise DatasetError(

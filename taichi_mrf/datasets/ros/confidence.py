@@ -18,7 +18,7 @@ from taichi_mrf.datasets.ros.color import COLOR_GAP
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 PART = "confidence"
@@ -44,10 +44,8 @@ class BagConfidence:
         if entry is None:
             return None
         message = self.reader.read(self.topic, entry)
-        try:
+        with naming(f"{self.reader.path}: topic {self.topic}"):
             return L515.sigma_m(_grades(messages.grey_image(message)), depth_m, camera)
-        except DatasetError as error:
-            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
 
 
 def find_confidence(

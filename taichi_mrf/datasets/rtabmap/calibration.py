@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.options import DISTORTION_COUNTS
-from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -46,10 +46,8 @@ class NodeCamera:
 def node_camera(blob: bytes, version: tuple[int, ...], where: str) -> NodeCamera:
     """A node's camera. Raises DatasetError, whose text begins with ``where``, for a damaged blob, a stereo
     pair and several cameras."""
-    try:
+    with naming(where, DatasetError, KeyframeError, ConfigError):
         return _with_header(blob) if version >= WITH_HEADER else _plain(blob)
-    except (DatasetError, KeyframeError, ConfigError) as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def _with_header(blob: bytes) -> NodeCamera:

@@ -30,7 +30,7 @@ from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
 from taichi_mrf.datasets.timed_poses import largest_gap, read_timed_poses, within_gap
 from taichi_mrf.datasets.trajectories import read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -123,15 +123,13 @@ def _images(path: Path, side: str, pattern: str) -> list[Path]:
 
 
 def _rig(path: Path, described: RigFile, left: Sequence[Path], options: ReadOptions) -> StereoRig:
-    try:
+    with naming(path, ConfigError):
         if options.camera is not None:
             return StereoRig(options.camera, described.baseline)
         fy = described.fx if described.fy is None else described.fy
         own = (described.fx, fy, described.cx, described.cy)
         camera = PinholeCamera(*first_size(path, left), *(options.intrinsics or own))
         return StereoRig(camera, described.baseline)
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def _stamps(folder: Path, described: RigFile, left: Sequence[Path]) -> list[float] | None:
