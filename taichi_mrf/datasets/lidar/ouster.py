@@ -18,8 +18,7 @@ from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.ouster_files import check_recording
-from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
-from taichi_mrf.datasets.lidar.scans import refuse_image_options
+from taichi_mrf.datasets.lidar.scans import LidarRecording, reach_of, refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import (
     INTERPOLATION_GAP,

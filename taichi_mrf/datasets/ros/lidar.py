@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Table
 from taichi_mrf.datasets.lidar.motion import Motion, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
-from taichi_mrf.datasets.lidar.recording import LidarRecording
-from taichi_mrf.datasets.lidar.scans import measured_points
+from taichi_mrf.datasets.lidar.scans import LidarRecording, measured_points
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.errors import DatasetError, naming

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH
 from taichi_mrf.experiments.peers.octomap import OctomapPeer
 from taichi_mrf.experiments.peers.our_maps import BONXAI, NO_OTHERS, MrfPeer, log_odds, visibility, wavemap
 from taichi_mrf.experiments.peers.peer import Knob, System
