@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ class Chosen(Derived):
 
     indices: Sequence[int] = field(kw_only=True)
 
-    @property
+    @cached_property
     def frame_names(self) -> Sequence[str]:
         """Those of the chosen frames."""
         return [self.source.frame_names[index] for index in self.indices]

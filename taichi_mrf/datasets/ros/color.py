@@ -83,13 +83,20 @@ def find_colors(
     if isinstance(found, str):
         return None, [f"color: {name} is not used: {found}"]
     own, distortion = found
-    entries = sensor.run.of([entry for entry, _ in reader.messages(name)])
-    partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
-    paired = [None if partner is None else entries[partner] for partner in partners]
-    alone = sum(entry is None for entry in paired)
+    entries, alone = paired(sensor, name, stamps, gap)
     how = "registered to depth" if own is None else "brought to the depth camera's pixels"
-    notes = [f"color: {name}, {how}" + (f"; {alone} of {len(paired)} images have none" if alone else "")]
-    return BagColors(reader, name, paired, own, distortion), notes
+    return BagColors(reader, name, entries, own, distortion), [f"color: {name}, {how}{alone}"]
+
+
+def paired(
+    sensor: BagSensor, topic: str, stamps: Sequence[float], gap: float | None
+) -> tuple[list[Entry | None], str]:
+    """The images of a topic that belong to depth images of some stamps, and how many have none, in words."""
+    entries = sensor.run.of([entry for entry, _ in sensor.reader.messages(topic)])
+    partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
+    found = [None if partner is None else entries[partner] for partner in partners]
+    alone = found.count(None)
+    return found, f"; {alone} of {len(found)} images have none" if alone else ""
 
 
 def _color_topics(reader: RosReader) -> list[DepthTopic]:
