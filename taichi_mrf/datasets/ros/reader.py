@@ -17,8 +17,7 @@ from typing import Any
 from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
-from taichi_mrf.datasets.ros.tolerance import ROS1, files_of, msgtype_of, open_tolerantly
-from taichi_mrf.datasets.ros.unpacking import bound_unpacking
+from taichi_mrf.datasets.ros.tolerance import ROS1, bound_unpacking, files_of, msgtype_of, open_tolerantly
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_folder
 from taichi_mrf.system.libraries import library
