@@ -47,6 +47,9 @@ _LARGER_THAN_MEMORY = (
     "its voxels; there are no pictures."
 )
 
+_MOST_UNANSWERED = 0.5
+"""A map that answers fewer of the held-out pixels makes its recording doubtful."""
+
 PICTURED_FRAMES = 3
 """Held-out frames in the picture of measured and rendered depth, at most."""
 
@@ -148,10 +151,14 @@ def write_run(
                 result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
     seen: list[str] = []
-    if posed is not None and contradicts(noise) and not haste.hurried:
+    unanswered = 0.0 if found is None else found.error.unanswered
+    if posed is not None and (contradicts(noise) or unanswered > _MOST_UNANSWERED) and not haste.hurried:
         with result.timed("checking"):
             seen = mistakes(posed)
     report = facts.report(result, found, noise, seen)
+    if seen and not contradicts(noise):
+        share = f"{unanswered:.0%} of the held-out pixels have no answer in the map"
+        report["notes"].append(f"{share}: {'; '.join(seen)}.")
     if not occupied:
         report["notes"].append(_nothing_occupied(facts.config))
     if chunked is not None:

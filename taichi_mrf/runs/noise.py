@@ -107,6 +107,8 @@ def _better(law: SigmaLaw | None) -> str:
 def _advice(sensor: SensorConfig, learnt: LearntSigma | None, check: NoiseCheck) -> str:
     if learnt is not None or sensor.sigma_scale != 1 or sensor.sigma_added:
         return "It was learnt from other frames than these: poses or the scene differ along the recording."
+    if check.factor < 1:
+        return "The sensor is better than that; --noise auto learns its noise from the recording."
     if contradicts(check):
         return "Poses may be off, or the recording is not what it is taken for: see taichi-mrf doctor SOURCE."
     return "Poses may be off, or the noise is another sensor's; --noise auto learns it from the recording."

@@ -212,3 +212,13 @@ def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp
     (note,) = [note for note in notes if "contradict" in note]
     assert "OpenGL" in note
     assert note.endswith("(--poses-are opengl mends it)")
+
+
+def test_map_names_the_mistake_where_it_answers_hardly_any_pixel(room: list[Frame], tmp_path: Path) -> None:
+    """Tenths of millimetres, which are read as millimetres, put all surfaces beyond the sensor's range."""
+    folder = write_tum(tmp_path / "mine", [replace(f, depth_m=10 * f.depth_m) for f in room])
+    coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--quiet", "--sensor.max-depth", 9)
+    assert carry_out("map", folder, "--out", tmp_path / "out", *coarse) == 0
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    (note,) = [note for note in report["notes"] if "held-out pixels have no answer" in note]
+    assert note.endswith("not 1000 (--depth-scale 10000 mends it).")
