@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from taichi_mrf import MRFMap, cast_rays, init
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH
 from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.experiments.exact import room_scene

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap, PolynomialNoise, SphericalCamera
 from taichi_mrf.config.schema import Arch, VolumeConfig
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.mapping.selection import surplus

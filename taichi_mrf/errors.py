@@ -78,6 +78,17 @@ _LONGEST = 200
 
 
 @contextmanager
+def naming(where: object, *kinds: type[Exception]) -> Iterator[None]:
+    """Raise what the block raises of some ``kinds``, DatasetError by default, as a DatasetError that begins
+    with ``where``: what reads a part of a file need not know its name."""
+    caught = kinds or (DatasetError,)
+    try:
+        yield
+    except caught as error:
+        raise DatasetError(f"{where}: {error}") from error
+
+
+@contextmanager
 def collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
     """Warnings of this package while the block runs, to be told in a report or as notes."""
     with warnings.catch_warnings(record=True) as warned:

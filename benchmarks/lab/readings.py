@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.lab.cell_truth import hidden_voxels
 from taichi_mrf import MRFMap
-from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
-from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh
+from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.occupancy_scores import reliability_bins

@@ -182,7 +182,7 @@ def sigma_of_glance(
 
 def is_default_noise(dataset: Dataset, sensor: SensorConfig) -> bool:
     """True if neither the parameters nor the recording say anything of noise."""
-    own, default = dataset.recorded_sigma is not None or dataset.states_pixel_sigma, SensorConfig()
+    own, default = dataset.stated.sigma is not None or dataset.stated.pixel_sigma, SensorConfig()
     return not own and all(getattr(sensor, name) == getattr(default, name) for name in NOISE)
 
 

@@ -24,8 +24,7 @@ from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
 from taichi_mrf.datasets.ros.summary import BagSummary
 from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.datasets.summary import summarise
-from taichi_mrf.datasets.unused_color import UNUSED_COLOR, note_unused_color
+from taichi_mrf.datasets.summary import UNUSED_COLOR, note_unused_color, summarise
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.chunked import ChunkedMap

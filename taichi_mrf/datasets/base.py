@@ -69,6 +69,26 @@ class BuiltIn:
     """Whether Taichi renders its frames, so that it must have been started before they are read."""
 
 
+@dataclass(frozen=True)
+class StatedSensor:
+    """What a recording, or its kind of sensor, says of the sensor; the defaults say nothing."""
+
+    sigma: tuple[float, ...] | None = None
+    """Standard deviation of depth: coefficients in ascending powers of depth in metres."""
+
+    pixel_sigma: bool = False
+    """Whether frames state a sigma for each pixel."""
+
+    origin: str = "the recording's own"
+    """Where the sigma and the like come from, in the words of a note."""
+
+    reach_m: float | None = None
+    """How far it measures; None if only its depths tell."""
+
+    pass_through: float | None = None
+    """Chance that a ray passes an occupied voxel; None for the default's 0."""
+
+
 @dataclass
 class Dataset(ABC):
     """A sequence of frames that are read one at a time.
@@ -94,30 +114,9 @@ class Dataset(ABC):
         return False
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviation of depth that the recording, or its kind of sensor, gives: coefficients in
-        ascending powers of depth in metres; None if it gives none."""
-        return None
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether its frames state a sigma for each pixel."""
-        return False
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where :attr:`recorded_sigma` and the like come from, in the words of a note."""
-        return "the recording's own"
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """How far the sensor measures, in metres; None if only its depths tell."""
-        return None
-
-    @property
-    def recorded_pass_through(self) -> float | None:
-        """Chance that a ray of this kind of sensor passes an occupied voxel; None for the default's 0."""
-        return None
+    def stated(self) -> StatedSensor:
+        """What is known of its sensor."""
+        return StatedSensor()
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -192,19 +191,11 @@ class Table(Dataset, Generic[AnyRow]):
     """What the images of confidence mean that come with the frames, None without."""
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """What the confidence is relative to, None without."""
-        return None if self.confidence is None else self.confidence.sigma
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether there are images of confidence."""
-        return self.confidence is not None
-
-    @property
-    def sigma_origin(self) -> str:
-        """Where the confidence's comes from."""
-        return super().sigma_origin if self.confidence is None else self.confidence.origin
+    def stated(self) -> StatedSensor:
+        """What the confidence is relative to."""
+        if self.confidence is None:
+            return super().stated
+        return StatedSensor(self.confidence.sigma, True, self.confidence.origin)
 
     @abstractmethod
     def load(self, index: int, row: AnyRow, T_world_camera: Pose) -> Frame:

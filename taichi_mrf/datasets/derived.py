@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, StatedSensor
 from taichi_mrf.errors import LostFrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
@@ -24,29 +25,9 @@ class Derived(Dataset):
         return self.source.endless
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
+    def stated(self) -> StatedSensor:
         """The source's."""
-        return self.source.recorded_sigma
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """As the source's."""
-        return self.source.states_pixel_sigma
-
-    @property
-    def sigma_origin(self) -> str:
-        """The source's."""
-        return self.source.sigma_origin
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The source's."""
-        return self.source.recorded_reach
-
-    @property
-    def recorded_pass_through(self) -> float | None:
-        """The source's."""
-        return self.source.recorded_pass_through
+        return self.source.stated
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -100,7 +81,7 @@ class Chosen(Derived):
 
     indices: Sequence[int] = field(kw_only=True)
 
-    @property
+    @cached_property
     def frame_names(self) -> Sequence[str]:
         """Those of the chosen frames."""
         return [self.source.frame_names[index] for index in self.indices]

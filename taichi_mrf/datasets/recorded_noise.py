@@ -57,10 +57,10 @@ def _with_origin(settings: Config, dataset: Dataset) -> Config:
 
 
 def _with_sigma(settings: Config, dataset: Dataset) -> Config:
-    own, sensor = dataset.recorded_sigma, settings.sensor
+    own, sensor = dataset.stated.sigma, settings.sensor
     if own is None or sensor.sigma == own:
         return settings
-    text, origin = ", ".join(f"{value:.4g}" for value in own), dataset.sigma_origin
+    text, origin = ", ".join(f"{value:.4g}" for value in own), dataset.stated.origin
     assumed = SensorConfig().sigma, load(shipped_configs()[RIG]).sensor.sigma
     if sensor.sigma_table is not None or sensor.sigma not in assumed:
         dataset.notes.append(f"sensor.sigma is set, so [{text}], {origin}, is not used")
@@ -77,14 +77,14 @@ def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
 
 
 def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
-    if not (dataset.states_pixel_sigma and settings.sensor.pixel_sigma):
+    if not (dataset.stated.pixel_sigma and settings.sensor.pixel_sigma):
         return settings
     dataset.notes.append("sensor.pixel_sigma is false: sensor.sigma holds for all pixels of these frames")
     return replace(settings, sensor=replace(settings.sensor, pixel_sigma=False))
 
 
 def _with_reach(settings: Config, dataset: Dataset) -> Config:
-    sensor, own = settings.sensor, dataset.recorded_reach
+    sensor, own = settings.sensor, dataset.stated.reach_m
     given = sensor.max_depth != SensorConfig().max_depth
     if own is not None and not given:
         return _reaching(settings, dataset, own, "as far as the first scan reaches")
@@ -138,7 +138,7 @@ def _with_floor(settings: Config, dataset: Dataset) -> Config:
     given, reach_m = settings.inference, settings.sensor.max_depth
     if given.outlier_floor is not None:
         return settings
-    short = dataset.recorded_pass_through is None and reach_m <= SensorConfig().max_depth
+    short = dataset.stated.pass_through is None and reach_m <= SensorConfig().max_depth
     depths_m = _some_depths(dataset) if short else np.zeros(0, np.float32)
     if depths_m.size:
         short = float(np.minimum(depths_m, reach_m).mean()) * given.surface_density <= LONG_RAY
@@ -151,7 +151,7 @@ def _with_outliers(settings: Config, per_m: float) -> Config:
 
 
 def _with_pass_through(settings: Config, dataset: Dataset) -> Config:
-    own = dataset.recorded_pass_through
+    own = dataset.stated.pass_through
     if own is None:
         return settings
     for method in METHODS.values():  # all of them: the tuning page may change to another
@@ -160,7 +160,7 @@ def _with_pass_through(settings: Config, dataset: Dataset) -> Config:
             continue
         name = f"{method.section}.pass_through"
         if method.name == settings.method:
-            dataset.notes.append(f"{name} is {own:g}, {dataset.sigma_origin}; setting {name} overrides it")
+            dataset.notes.append(f"{name} is {own:g}, {dataset.stated.origin}; setting {name} overrides it")
         changed: dict[str, Any] = {method.section: replace(section, pass_through=own)}
         settings = replace(settings, **changed)
     return settings

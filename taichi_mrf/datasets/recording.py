@@ -3,19 +3,19 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table
+from taichi_mrf.datasets.base import Row, StatedSensor, Table
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -54,9 +54,9 @@ class Recording(Table[RecordedFrame]):
     color_camera: ColorCamera | None = None
 
     @property
-    def states_pixel_sigma(self) -> bool:
-        """Whether frames have images of confidence."""
-        return any(frame.confidence_file is not None for frame in self.rows)
+    def stated(self) -> StatedSensor:
+        """What the confidence is relative to, which only some folders hold."""
+        return replace(super().stated, pixel_sigma=any(row.confidence_file is not None for row in self.rows))
 
     def load(self, index: int, row: RecordedFrame, T_world_camera: Pose) -> Frame:
         """Read the images of one frame, which must have the camera's size."""
@@ -74,10 +74,8 @@ class Recording(Table[RecordedFrame]):
     ) -> NDArray[np.float32]:
         """The sigma of each pixel, from an image of its confidence. Raises DatasetError."""
         levels = read_grey(path)
-        try:
+        with naming(path):
             return confidence.sigma_m(levels, depth_m, camera)
-        except DatasetError as error:
-            raise DatasetError(f"{path}: {error}") from error
 
     def _read_color(
         self, path: Path, depth_m: NDArray[np.float32], camera: PinholeCamera

@@ -15,7 +15,7 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.plugs import plugs
 from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros.names import is_bag
-from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings
+from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings, naming
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
@@ -99,10 +99,8 @@ def bag_path(source: str) -> Path | None:
 def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     """Apply the options that all formats share: the caller's intrinsics, undistortion, every n-th pixel."""
     if options.intrinsics is not None:
-        try:
+        with naming(dataset.name, ConfigError):
             recorded = pinhole(dataset.camera, "--camera")
-        except ConfigError as error:
-            raise DatasetError(f"{dataset.name}: {error}") from error
         dataset.camera = PinholeCamera(recorded.width, recorded.height, *options.intrinsics)
     conventions = options.conventions
     dataset.tracked = dataset.tracked or options.track

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import Derived
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.errors import ConfigError, FrameError, naming
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.frame import Frame
 
@@ -76,14 +76,10 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
     distorted = any(distortion)
     if not distorted and stride == 1:
         return dataset
-    try:
+    with naming(dataset.name, ConfigError):
         recorded = pinhole(dataset.camera, "--undistort" if distorted else "--image-scale")
-    except ConfigError as error:
-        raise DatasetError(f"{dataset.name}: {error}") from error
-    try:
+    with naming(f"{dataset.name}: image_scale 1/{stride} leaves no pixel", ConfigError):
         camera, first = strided(recorded, stride)
-    except ConfigError as error:
-        raise DatasetError(f"{dataset.name}: image_scale 1/{stride} leaves no pixel: {error}") from error
     rows, columns = np.meshgrid(
         first[0] + stride * np.arange(camera.height),
         first[1] + stride * np.arange(camera.width),

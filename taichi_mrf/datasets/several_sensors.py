@@ -26,11 +26,11 @@ import numpy as np
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.values import check_field, from_dict
-from taichi_mrf.datasets.base import Dataset, Row, Table
+from taichi_mrf.datasets.base import Dataset, Row, StatedSensor, Table
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -114,9 +114,9 @@ class SeveralSensors(Table[SensorFrame]):
     sensors: Sequence[RecordedSensor] = field(kw_only=True)
 
     @property
-    def recorded_reach(self) -> float | None:
-        """That of the sensor that reaches farthest."""
-        return max(sensor.range_m[1] for sensor in self.sensors)
+    def stated(self) -> StatedSensor:
+        """The reach of the sensor that reaches farthest."""
+        return StatedSensor(reach_m=max(sensor.range_m[1] for sensor in self.sensors))
 
     def sensor_of(self, index: int) -> str:
         """The name of the sensor that took a frame."""
@@ -125,10 +125,8 @@ class SeveralSensors(Table[SensorFrame]):
     def load(self, index: int, row: SensorFrame, T_world_camera: Pose) -> Frame:
         """The frame of its sensor."""
         sensor = row.taken_by
-        try:
+        with naming(sensor.name, FrameError):
             frame = sensor.dataset.read(row.index)
-        except FrameError as error:
-            raise DatasetError(f"{sensor.name}: {error}") from error
         least, most = sensor.range_m
         inside = (frame.depth_m >= least) & (frame.depth_m <= most)
         return replace(
@@ -156,10 +154,8 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
         raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
     sensors, rows = [], []
     for entry, name in zip(described.sensors, names, strict=True):
-        try:
+        with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError):
             sensor = _open_sensor(path, entry, name, options)
-        except (ConfigError, DatasetError, KeyframeError) as error:
-            raise DatasetError(f"{path}: {name}: {error}") from error
         stamps, frame_names = sensor.dataset.stamps(), sensor.dataset.frame_names
         for i in range(0, len(sensor.dataset), entry.every):
             pose = partial(_pose, sensor, i)
@@ -178,10 +174,8 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
 
 
 def _pose(sensor: RecordedSensor, index: int) -> Pose:
-    try:
+    with naming(sensor.name, FrameError):
         return sensor.dataset.pose(index) @ sensor.T_poses_sensor
-    except FrameError as error:
-        raise DatasetError(f"{sensor.name}: {error}") from error
 
 
 def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions) -> RecordedSensor:
@@ -194,8 +188,8 @@ def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions
     dataset = open_dataset(source, color=options.color, **keywords)
     if dataset.endless or dataset.tracked:
         raise DatasetError("only recordings with poses can be put together")
-    sigma = entry.sigma or dataset.recorded_sigma
-    most = entry.max_depth or dataset.recorded_reach or SensorConfig().max_depth
+    sigma = entry.sigma or dataset.stated.sigma
+    most = entry.max_depth or dataset.stated.reach_m or SensorConfig().max_depth
     T = as_pose(np.reshape(entry.T_poses_sensor, (-1, 4))) if entry.T_poses_sensor else np.eye(4)
     noise = None if sigma is None else PolynomialNoise(sigma, entry.bias)
     return RecordedSensor(name, dataset, noise, entry.sigma is not None, T, (entry.min_depth, most))

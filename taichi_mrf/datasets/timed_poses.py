@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.trajectories import read_trajectory, rotation_of, valid_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
@@ -26,15 +27,44 @@ _NEARLY_EQUAL = 1e-9
 """Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
 
 
+def largest_gap(options: ReadOptions) -> float:
+    """The largest time in seconds to a neighbouring pose that is interpolated."""
+    return INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+
+
+def within_gap(
+    stamps: Sequence[float],
+    poses: Sequence[Pose | None],
+    gap: float,
+    what: str,
+    where: str,
+    source: str,
+    posed: Sequence[float] | NDArray = (),
+) -> tuple[list[tuple[int, Pose]], list[str]]:
+    """The indices of the data (``what``, such as "images") that have a pose near enough in time, with these,
+    and a note that counts the others. ``stamps`` are the data's, ``posed`` those of the poses in ``source``.
+    Raises DatasetError, which begins with ``where``, if none has a pose."""
+    found = [(i, pose) for i, pose in enumerate(poses) if pose is not None]
+    if not found:
+        span = f", {min(posed):.3f} to {max(posed):.3f} s" if len(posed) else ""
+        raise DatasetError(
+            f"{where}: none of {len(stamps)} {what} ({min(stamps):.3f} to {max(stamps):.3f} s) has poses "
+            f"within {gap:g} s on both sides ({source}{span}){apart_in_words(stamps, posed, gap)}"
+        )
+    dropped = len(poses) - len(found)
+    note = f"{dropped} of {len(poses)} {what} dropped: no poses within {gap:g} s on both sides"
+    return found, [note] if dropped else []
+
+
 def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, gap: float) -> str:
-    """Why no image has a pose, by the ``stamps`` of both in seconds, and the remedy; empty if not known."""
+    """Why nothing has a pose, by the ``stamps`` of both in seconds, and the remedy; empty if not known."""
     if not len(stamps) or not len(posed):
         return ""
     first, last, begin, end = min(stamps), max(stamps), min(posed), max(posed)
     if last < begin or first > end:
         return (
-            f": the clocks of images and poses are {abs(begin - first):.3f} s apart; poses with the stamps "
-            "of the images are needed, as ?poses=FILE of a bag"
+            f": the clocks of sensor and poses are {abs(begin - first):.3f} s apart; poses with the sensor's "
+            "stamps are needed, as ?poses=FILE"
         )
     usual = float(np.median(np.diff(np.unique(posed)))) if len(posed) > 1 else 0.0
     return (

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.conventions import AXES
+from taichi_mrf.datasets.depth_scale import SeenAgain, seen_again
 from taichi_mrf.datasets.mended import pose_of
-from taichi_mrf.datasets.overlap import SeenAgain, seen_again
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
 from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View

@@ -7,7 +7,7 @@ from typing import Any
 
 from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap, WavemapMap
 from taichi_mrf.config.schema import to_yaml
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
 from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
-from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at

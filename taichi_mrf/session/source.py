@@ -15,7 +15,7 @@ from taichi_mrf.datasets.entries import holds_frames
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.mapping.intake import hold_out_of

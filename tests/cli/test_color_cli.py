@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from console import FAST, carry_out
 
-from taichi_mrf.datasets.unused_color import UNUSED_COLOR
+from taichi_mrf.datasets.summary import UNUSED_COLOR
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.ply import photo_at
 from taichi_mrf.methods.registry import load_map

@@ -7,8 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.datasets.laser.floor_plan import Building, building, way
-from taichi_mrf.datasets.laser.floor_plan_scans import FloorPlanOptions, poses_along, simulate_scans
+from taichi_mrf.datasets.laser.floor_plan_scans import (
+    Building,
+    FloorPlanOptions,
+    building,
+    poses_along,
+    simulate_scans,
+    way,
+)
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError

@@ -21,7 +21,7 @@ from taichi_mrf.sensor.ray_table import RayTable
 def test_a_cloud_with_rows_is_an_image(tmp_path: Path, kind: Kind, big: bool) -> None:
     dataset = open_dataset(write(tmp_path, kind, big=big))
     assert isinstance(dataset, LidarBag)
-    assert (len(dataset), dataset.dropped, dataset.recorded_reach) == (SCANS, 0, 10.0)
+    assert (len(dataset), dataset.dropped, dataset.stated.reach_m) == (SCANS, 0, 10.0)
     for scan, frame in enumerate(dataset):
         np.testing.assert_allclose(frame.camera.rays(), CAMERA.rays(), atol=1e-5)
         assert frame.no_return is not None

@@ -65,8 +65,8 @@ def test_grades_are_a_sigma(opened: Callable[..., Dataset], kind: Kind, shift: i
 def test_a_bag_without_confidence_states_no_sigma(opened: Callable[..., Dataset]) -> None:
     dataset = opened(lambda bag: confidence(bag, "/other/confidence/image_rect_raw"))
     assert dataset.read(0).sigma_m is None
-    assert not dataset.states_pixel_sigma
-    assert dataset.recorded_sigma is None
+    assert not dataset.stated.pixel_sigma
+    assert dataset.stated.sigma is None
     assert not any(note.startswith("confidence") for note in dataset.notes)
 
 
@@ -102,7 +102,7 @@ def test_confidence_that_does_not_fit_is_named(
     opened: Callable[..., Dataset], write: Callable[[Bag], None], problem: str
 ) -> None:
     dataset = opened(write, query="?depth=/camera/depth/image_raw")
-    assert not dataset.states_pixel_sigma
+    assert not dataset.stated.pixel_sigma
     (note,) = [note for note in dataset.notes if note.startswith("confidence: ")]
     assert f"{TOPIC} is not used: " in note
     assert problem in note

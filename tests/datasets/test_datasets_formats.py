@@ -26,7 +26,7 @@ from every_format import WHOLE_NUMBERS
 from rtabmap_database import rvl
 
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.rtabmap.depth import decode_depth
+from taichi_mrf.datasets.rtabmap.blobs import decode_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera

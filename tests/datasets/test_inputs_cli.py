@@ -16,7 +16,7 @@ from inputs_bags import Bag, writing
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.unused_color import UNUSED_COLOR
+from taichi_mrf.datasets.summary import UNUSED_COLOR
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -196,7 +196,7 @@ def test_a_recording_gets_the_poses_of_a_file(library: type[Pipeline], recording
         assert frame.name == f"realsense-{100 + i:06d}"
         np.testing.assert_allclose(frame.T_world_camera[:3, 3], [0.1 * i, 0, 0], atol=1e-6)
     assert not any("stand still" in note for note in source.notes)
-    with pytest.raises(DatasetError, match=r"walk\.bag: none of its 6 depth images .* within 0\.01 s"):
+    with pytest.raises(DatasetError, match=r"walk\.bag: none of 6 depth images .* within 0\.01 s"):
         open_dataset(f"realsense:{recording}?poses={poses}", max_time_gap=0.01)
 
 

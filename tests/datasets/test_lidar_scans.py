@@ -12,8 +12,7 @@ from point_clouds import Walk, write_pcd, write_ply, write_scans, write_velodyne
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M, reach_of
-from taichi_mrf.datasets.lidar.scans import LidarScans
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M, LidarScans, reach_of
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic import mesh_scene
-from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
-from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh, load_mesh
+from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.datasets.synthetic.mesh_sequence import MeshSequence
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
 from taichi_mrf.errors import DatasetError, FrameError

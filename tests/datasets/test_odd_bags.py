@@ -226,7 +226,7 @@ REFUSED: dict[str, tuple[Callable[[Bag], object], str]] = {
         lambda bag: but(bag, lambda i: steps(i).astype(np.float32), "32FC1"),
         "hardly metres: --depth-scale 1000",
     ),
-    "clocks": (lambda bag: but(bag, late=-1000.0), r"clocks of images and poses are 1000\.000 s apart"),
+    "clocks": (lambda bag: but(bag, late=-1000.0), r"clocks of sensor and poses are 1000\.000 s apart"),
     "slow": (slow, r"poses are 1 s apart; --max-time-gap 1 "),
     "path": (lambda bag: (images(bag), path_of(bag)), rf"/path: it names no body.*\?body={FRAME}"),
 }

@@ -24,8 +24,8 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.image_header import claimed_size
 from taichi_mrf.datasets.images import read_color, read_depth, read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.ros import unpacking
-from taichi_mrf.datasets.ros.unpacking import bound_unpacking
+from taichi_mrf.datasets.ros import tolerance
+from taichi_mrf.datasets.ros.tolerance import bound_unpacking
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -285,7 +285,7 @@ def test_bags_with_compressed_messages_or_files_are_read_and_bounded(
         plain(Bag("mcap" if storage is StoragePlugin.MCAP else "db3", writer))
     assert len(open_dataset(tmp_path / "walk")) > 0
     for bound in ("_LEAST_BOUND", "_LARGEST_RATIO", "_LEAST_FILE", "_LARGEST_FILE_RATIO"):
-        monkeypatch.setattr(unpacking, bound, 1)
+        monkeypatch.setattr(tolerance, bound, 1)
     what = "message" if mode is CompressionMode.MESSAGE else "file"
     with pytest.raises(DatasetError, match=rf"a {what} of [\d,]+ bytes .*unpacks? to more than it may"):
         open_dataset(tmp_path / "walk").read(0)

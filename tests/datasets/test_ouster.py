@@ -140,7 +140,7 @@ def test_a_sensor_that_stands_still_gives_images(recording: Path, monkeypatch: p
     install(monkeypatch, Source([STILL, STILL], ranges))
     dataset = open_dataset(recording)
     frame = dataset.read(1)
-    assert (len(dataset), frame.name, dataset.recorded_reach) == (2, "000001", 10.0)
+    assert (len(dataset), frame.name, dataset.stated.reach_m) == (2, "000001", 10.0)
     assert frame.camera == dataset.camera
     assert frame.no_return is not None
     assert np.argwhere(frame.no_return).tolist() == [[1, 4 + SHIFTS[1]]]
@@ -210,7 +210,7 @@ def test_the_reach_is_that_of_the_first_scan_with_returns(
     source.frames[0].field = lambda name: np.zeros((ROWS, COLUMNS), np.uint32)
     source.frames[1].field = lambda name: np.full((ROWS, COLUMNS), 23_000, np.uint32)
     install(monkeypatch, source)
-    assert open_dataset(recording).recorded_reach == 30.0
+    assert open_dataset(recording).stated.reach_m == 30.0
 
 
 def test_a_sensor_that_moves_between_scans_does_not_stand_still(

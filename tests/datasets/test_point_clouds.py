@@ -14,8 +14,7 @@ from point_clouds import Walk, las_head, lzf, write_pcd, write_ply
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.clouds import is_cloud, natural, read_cloud
-from taichi_mrf.datasets.lidar.lzf import unpack
-from taichi_mrf.datasets.lidar.pcd_file import read_pcd
+from taichi_mrf.datasets.lidar.pcd_file import read_pcd, unpack_lzf
 from taichi_mrf.datasets.lidar.ply_file import read_ply_points
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
@@ -88,7 +87,7 @@ def test_what_is_odd_of_a_recording_is_a_note_and_no_warning(
 @given(st.binary(max_size=400), st.integers(1, 60))
 def test_lzf_gives_back_what_was_packed(data: bytes, times: int) -> None:
     data = data + data[:7] * times
-    assert unpack(lzf(data), len(data)) == data
+    assert unpack_lzf(lzf(data), len(data)) == data
 
 
 @pytest.mark.parametrize(
@@ -103,7 +102,7 @@ def test_lzf_gives_back_what_was_packed(data: bytes, times: int) -> None:
 )
 def test_damaged_lzf_is_refused(packed: bytes, size: int, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
-        unpack(packed, size)
+        unpack_lzf(packed, size)
 
 
 Change = tuple[bytes, bytes, str]

@@ -82,7 +82,7 @@ def test_a_recording_without_confidence_states_no_sigma(tmp_path: Path) -> None:
         (folder / f"rgbd/{i}.conf").unlink()
     dataset = open_dataset(folder)
     assert dataset.read(0).sigma_m is None
-    assert dataset.recorded_sigma is None
+    assert dataset.stated.sigma is None
 
 
 def test_each_frame_may_have_its_own_camera(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from sliding_camera import CAMERA, SlidingCamera
 from taichi_mrf.config.inference import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.base import StatedSensor
 from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR, with_recorded_noise, with_tuned_noise
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX
 from taichi_mrf.sensor.frame import Frame
@@ -25,8 +26,8 @@ class Street(SlidingCamera):
     lambda_: float = 7.5e-4
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...]:
-        return (0.0, 0.0, self.lambda_)
+    def stated(self) -> StatedSensor:
+        return StatedSensor((0.0, 0.0, self.lambda_))
 
     def read(self, index: int) -> Frame:
         frame = super().read(index)

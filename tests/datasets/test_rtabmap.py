@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.registry import format_name
-from taichi_mrf.datasets.rtabmap.calibration import node_camera
+from taichi_mrf.datasets.rtabmap.blobs import decode_depth, node_camera
 from taichi_mrf.datasets.rtabmap.database import RtabmapDatabase
-from taichi_mrf.datasets.rtabmap.depth import decode_depth
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera

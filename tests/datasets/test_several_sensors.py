@@ -12,7 +12,7 @@ from point_clouds import Walk, write_scans
 
 from taichi_mrf.config.schema import Config, KeyframeConfig, SensorConfig
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.several_sensors import SeveralSensors
 from taichi_mrf.errors import DatasetError, FrameError

@@ -86,7 +86,7 @@ def test_errors_of_matching_grow_with_it() -> None:
 def test_frames_state_it_in_metres_unless_they_are_told_not_to(tmp_path: Path) -> None:
     dataset = open_dataset(write(tmp_path / "rig", ["a", "b", "c"]))
     assert isinstance(dataset, StereoPairs)
-    assert dataset.states_pixel_sigma
+    assert dataset.stated.pixel_sigma
     frame = dataset.read(0)
     assert frame.sigma_m is not None
     measured = frame.depth_m > 0
@@ -98,5 +98,5 @@ def test_frames_state_it_in_metres_unless_they_are_told_not_to(tmp_path: Path) -
     assert frame.own_for(SensorConfig()).sigma_m is frame.sigma_m
     assert frame.own_for(SensorConfig(pixel_sigma=False)).sigma_m is None
     dataset.matching = replace(dataset.matching, pixel_sigma=False)
-    assert not dataset.states_pixel_sigma
+    assert not dataset.stated.pixel_sigma
     assert dataset.read(0).sigma_m is None

@@ -48,7 +48,7 @@ def test_confidence_is_a_sigma(folder: Path) -> None:
 def test_without_confidence_the_sigma_is_that_of_the_format(folder: Path) -> None:
     (folder / "confidence" / "000001.png").unlink()
     dataset = open_dataset(folder)
-    assert dataset.states_pixel_sigma
+    assert dataset.stated.pixel_sigma
     assert dataset.read(1).sigma_m is None
     assert dataset.read(2).sigma_m is not None
 

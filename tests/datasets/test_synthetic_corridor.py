@@ -10,11 +10,11 @@ from console import carry_out
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.registry import format_name
-from taichi_mrf.datasets.synthetic.corridor import SyntheticCorridor
-from taichi_mrf.datasets.synthetic.corridor_plan import (
+from taichi_mrf.datasets.synthetic.corridor import (
     CORRIDOR_IN_WORLD,
     HALF_WIDTH,
     Room,
+    SyntheticCorridor,
     corridor_length,
     corridor_scene,
     waypoints,

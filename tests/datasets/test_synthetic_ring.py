@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.synthetic.ring import SyntheticRing
-from taichi_mrf.datasets.synthetic.ring_plan import OVERLAP_M
-from taichi_mrf.datasets.synthetic.smooth_way import SmoothWay
+from taichi_mrf.datasets.synthetic.ring import OVERLAP_M, SmoothWay, SyntheticRing
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import as_pose, tangent_norms
 

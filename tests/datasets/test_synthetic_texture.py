@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.synthetic.rendered_sequence import CONTRAST, CUBES_M, pattern
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
-from taichi_mrf.datasets.synthetic.texture import CONTRAST, CUBES_M, pattern
 
 SMALL = "synthetic:room?width=80&height=60&frames=60"
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from oracles.traversal import segments
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
-from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
+from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 from taichi_mrf.errors import CapacityError, FrameError
 from taichi_mrf.evaluation.occupancy_truth import (

@@ -8,7 +8,7 @@ import pytest
 from tracked_room import CONFIG, frames
 
 from taichi_mrf.config.schema import PoseConfig
-from taichi_mrf.datasets.synthetic.texture import pattern
+from taichi_mrf.datasets.synthetic.rendered_sequence import pattern
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.mapping.tracking import Tracker, wants_color
 from taichi_mrf.methods.mrf.map import MRFMap

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taichi_mrf.datasets.synthetic.texture import pattern
+from taichi_mrf.datasets.synthetic.rendered_sequence import pattern
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame

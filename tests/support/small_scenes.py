@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Point, Scene, Solid
+from taichi_mrf.datasets.synthetic.mesh_scene import scene_mesh
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
 from taichi_mrf.geometry.poses import Pose, look_at

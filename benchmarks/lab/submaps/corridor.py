@@ -12,8 +12,7 @@ from taichi_mrf import ChunkedMap, Config
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.datasets.synthetic.corridor import NAME
-from taichi_mrf.datasets.synthetic.corridor_plan import floor_area_m2
+from taichi_mrf.datasets.synthetic.corridor import NAME, floor_area_m2
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result

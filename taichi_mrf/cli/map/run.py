@@ -21,7 +21,7 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import collected_warnings
 from taichi_mrf.mapping.intake import Added

@@ -34,7 +34,7 @@ from taichi_mrf.datasets.formats.record3d_metadata import MOST_PIXELS, Metadata,
 from taichi_mrf.datasets.images import decode_color
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -87,17 +87,13 @@ class Record3D(Table[Record3DFrame]):
         """The pixels (H, W) in a file of depth or confidence."""
         size = self.camera.width * self.camera.height * dtype.itemsize
         data = self.files.read(file, _packed_bound(size))
-        try:
+        with naming(f"{self.files.where(file)}"):
             return np.frombuffer(unpacked(data, size), dtype).reshape(self.camera.shape)
-        except DatasetError as error:
-            raise DatasetError(f"{self.files.where(file)}: {error}") from error
 
     def _sigma(self, file: str, depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[np.float32]:
         levels = self._array(file, np.dtype(np.uint8))
-        try:
+        with naming(f"{self.files.where(file)}"):
             return ARKIT.sigma_m(levels, depth_m, camera)
-        except DatasetError as error:
-            raise DatasetError(f"{self.files.where(file)}: {error}") from error
 
     def _color(
         self, file: str, own: PinholeCamera, depth_m: NDArray[np.float32], camera: PinholeCamera
@@ -183,10 +179,8 @@ def _camera(files: Files, first: int, metadata: Metadata, options: ReadOptions) 
             )
         return options.camera
     own = metadata.cameras([first])
-    try:
+    with naming(metadata.where):
         return _of_depth(metadata.color_camera if own is None else own[0], shape)
-    except DatasetError as error:
-        raise DatasetError(f"{metadata.where}: {error}") from error
 
 
 def _file(number: int, kind: str) -> str:
@@ -208,10 +202,8 @@ def _packed_bound(size: int) -> int:
 def _depth_shape(files: Files, first: int, metadata: Metadata) -> tuple[int, int]:
     """(height, width) of depth images that the metadata do not tell: they have the proportions of colour."""
     name, color = _file(first, "depth"), metadata.color_camera
-    try:
+    with naming(f"{files.where(name)}"):
         pixels = held_bytes(files.read(name, _packed_bound(4 * MOST_PIXELS))) // 4
-    except DatasetError as error:
-        raise DatasetError(f"{files.where(name)}: {error}") from error
     width = max(1, round(math.sqrt(pixels * color.width / color.height)))
     height = pixels // width
     if not 0 < width * height == pixels <= MOST_PIXELS:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError, DatasetError, said
+from taichi_mrf.errors import ConfigError, DatasetError, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera
 
 MOST_PIXELS = 1 << 24
@@ -60,10 +60,8 @@ class Metadata:
         if len(known) == 0:
             return None
         rows = known[np.maximum(np.searchsorted(known, numbers, "right") - 1, 0)]
-        try:
+        with naming(f"{self.where}: {name}", ConfigError):
             return [PinholeCamera(*size, *map(float, self.intrinsics[row])) for row in rows]
-        except ConfigError as error:
-            raise DatasetError(f"{self.where}: {name}: {error}") from error
 
     def stamps(self, numbers: Sequence[int]) -> tuple[list[float], list[str]]:
         """When each of these frames was taken, in seconds, and notes. Raises DatasetError."""
@@ -112,10 +110,8 @@ def _color_camera(where: str, values: Mapping[str, Any]) -> PinholeCamera:
     K = _numbers(values.get("K"))
     if K.shape != (9,) or not np.isfinite(K).all():
         raise DatasetError(f"{where}: K is no list of 9 numbers")
-    try:
+    with naming(f"{where}: K", ConfigError):
         return PinholeCamera.from_matrix(width, height, K.reshape(3, 3).T)
-    except ConfigError as error:
-        raise DatasetError(f"{where}: K: {error}") from error
 
 
 def _table(where: str, values: Mapping[str, Any], name: str, columns: int) -> NDArray[np.float64]:

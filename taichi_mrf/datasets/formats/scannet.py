@@ -24,7 +24,7 @@ from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import is_lost, read_matrix_file
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
@@ -105,10 +105,8 @@ def _extrinsics(folder: Path, camera: str) -> Pose:
     path = folder / f"intrinsic/extrinsic_{camera}.txt"
     if not path.is_file():
         return np.eye(4)
-    try:
+    with naming(path, KeyframeError):
         return read_matrix_file(path)
-    except KeyframeError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def _own_camera(folder: Path, image: Path) -> PinholeCamera | None:

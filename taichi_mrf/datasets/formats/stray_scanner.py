@@ -22,7 +22,7 @@ from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import is_file, read_text
 
@@ -84,10 +84,8 @@ def _camera(path: Path) -> PinholeCamera:
             raise ValueError
     except ValueError:
         raise DatasetError(f"{path}: expected a 3 x 3 matrix of numbers, with commas between them") from None
-    try:
+    with naming(path, ConfigError):
         return PinholeCamera.from_matrix(*COLOR_SIZE, matrix).scaled(DEPTH_WIDTH / COLOR_SIZE[0])
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def _read_odometry(path: Path) -> dict[int, RecordedPose]:

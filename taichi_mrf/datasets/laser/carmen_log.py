@@ -19,8 +19,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.laser.no_return import DEFAULT_M, find_no_return_m
-from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
+from taichi_mrf.datasets.laser.scans import (
+    DEFAULT_M,
+    LaserScans,
+    find_no_return_m,
+    problem_of_scan,
+    skipped_note,
+)
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import open_regular
 
@@ -49,7 +54,7 @@ def read_carmen_log(
     """Read all scans of a log. Raises DatasetError, which names the file and the line.
 
     A beam of at least ``no_return_m`` metres has no return. Without it the range is found in the log
-    (no_return.py); a line of ROBOTLASER1 also gives the scanner's greatest range. Beams without a return
+    (find_no_return_m); a line of ROBOTLASER1 also gives the scanner's greatest range. Beams without a return
     carry no evidence (``no_return_is_free`` is False): in the logs that this was measured on, 59% (Intel) and
     95% (Freiburg 079) of them would go through a wall within 5 m.
     """

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.laser.no_return import find_no_return_m
-from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
+from taichi_mrf.datasets.laser.scans import LaserScans, find_no_return_m, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import open_regular
 from taichi_mrf.system.npz_file import open_npz

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.lidar.las_file import read_timed_las
-from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.datasets.lidar.scan_poses import TEXTS
-from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap, read_timed_poses, within_gap
 from taichi_mrf.datasets.trajectories import is_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse
@@ -57,28 +56,19 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
         )
     trajectory = read_timed_poses(poses_path)
     points_m, times = read_timed_las(path)
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
-    scans, dropped = [], 0
-    for number, members in _groups(path, times, chosen.seconds):
-        stamp = 0.5 * float(times[members[0]] + times[members[-1]])
-        T_world_lidar = trajectory.at(stamp, gap)
-        if T_world_lidar is None:
-            dropped += 1
-            continue
+    gap, groups = largest_gap(options), _groups(path, times, chosen.seconds)
+    stamps = [0.5 * float(times[members[0]] + times[members[-1]]) for _, members in groups]
+    at = [trajectory.at(stamp, gap) for stamp in stamps]
+    posed, notes = within_gap(stamps, at, gap, "scans", str(path), str(poses_path), trajectory.stamps)
+    scans = []
+    for i, T_world_lidar in posed:
+        number, members = groups[i]
         read = partial(_in_lidar_frame, points_m, members)
         starts = partial(_starts, trajectory, times, members, T_world_lidar, gap)
-        at = T_world_lidar, str(poses_path)
-        scans.append(RecordedScan(f"{number:06d}", stamp, *at, read, str(path), starts))
-    if not scans:
-        raise DatasetError(
-            f"{path}: none of its {dropped} scans ({times.min():.3f} to {times.max():.3f} s) has poses "
-            f"within {gap:g} s on both sides in {poses_path} ({trajectory.stamps[0]:.3f} to "
-            f"{trajectory.stamps[-1]:.3f} s)"
-        )
-    notes = [f"{len(times)} points in {len(scans)} scans of {chosen.seconds:g} s"]
-    if dropped:
-        notes.append(f"{dropped} scans dropped: no poses within {gap:g} s on both sides")
-    return lidar_scans(path.stem, scans, notes, dropped, options)
+        pose = T_world_lidar, str(poses_path)
+        scans.append(RecordedScan(f"{number:06d}", stamps[i], *pose, read, str(path), starts))
+    notes.insert(0, f"{len(times)} points in {len(scans)} scans of {chosen.seconds:g} s")
+    return lidar_scans(path.stem, scans, notes, len(groups) - len(scans), options)
 
 
 def _poses_beside(path: Path) -> Path | None:

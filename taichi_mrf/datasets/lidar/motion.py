@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
 from taichi_mrf.datasets.timed_poses import interpolate
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.sensor.ray_table import RayTable

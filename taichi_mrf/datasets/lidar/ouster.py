@@ -18,11 +18,16 @@ from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.ouster_files import check_recording
-from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
-from taichi_mrf.datasets.lidar.scans import refuse_image_options
+from taichi_mrf.datasets.lidar.scans import LidarRecording, reach_of, refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
-from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.datasets.timed_poses import (
+    INTERPOLATION_GAP,
+    TimedPoses,
+    largest_gap,
+    read_timed_poses,
+    within_gap,
+)
+from taichi_mrf.errors import DatasetError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import check_regular
@@ -72,10 +77,8 @@ class OusterScans(LidarRecording, Table[RecordedColumns]):
 
     def load(self, index: int, row: RecordedColumns, T_world_camera: Pose) -> Frame:
         """Decode one scan, which must have a column."""
-        try:
+        with naming(self.path):
             columns = columns_of(self.source, row.number, self.sensor)
-        except DatasetError as error:
-            raise DatasetError(f"{self.path}: {error}") from error
         if columns is None:
             raise DatasetError(f"{self.path}: it has no column")
         at = _poses(columns, self.trajectory, self.gap)
@@ -150,46 +153,43 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     check_regular(path, DatasetError)
     tracked = options.track or chosen.poses == TRACK
     trajectory = None if tracked or not chosen.poses else read_timed_poses(Path(chosen.poses))
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    gap = largest_gap(options)
     source, count = _open(path, chosen)
     beams = _beams(path, source, chosen.sensor)
-    scans, notes, dropped, reach_m = [], [], 0, None
-    poses = []
+    scans: list[RecordedColumns] = []
+    at: list[Pose | None] = []
+    ends: list[Pose] = []
+    reach_m = None
     for number in range(count):
         try:
             columns = columns_of(source, number, chosen.sensor)
         except DatasetError:
             columns = None
         if columns is None:
-            dropped += 1
             continue
         first, last = columns.stamps[columns.valid][[0, -1]]
         stamp = 0.5 * (first + last)
-        if trajectory is not None and trajectory.at(stamp, gap) is None:
-            dropped += 1
-            continue
-        T_world_sensor = np.eye(4) if tracked else _poses(columns, trajectory, gap)(stamp)
-        at = partial(_pose, path, T_world_sensor, beams.T_sensor_lidar)
-        scans.append(RecordedColumns(f"{number:06d}", stamp, at, str(path), number))
-        poses += [columns.poses.poses[0], columns.poses.poses[-1]]
-        if reach_m is None and columns.range_m.any():
+        at.append(np.eye(4) if tracked else _poses(columns, trajectory, gap)(stamp))
+        pose = partial(_pose, path, at[-1], beams.T_sensor_lidar)
+        scans.append(RecordedColumns(f"{number:06d}", stamp, pose, str(path), number))
+        ends += [columns.poses.poses[0], columns.poses.poses[-1]]
+        if reach_m is None and at[-1] is not None and columns.range_m.any():
             reach_m = reach_of(columns.range_m)
     if not scans:
-        why = (
-            f"has poses within {gap:g} s on both sides" if trajectory is not None and count else "can be read"
-        )
-        raise DatasetError(f"{path}: none of its {count} scans {why}")
-    if dropped:
-        notes.append(
-            f"{dropped} of {count} scans dropped: damaged, or no poses within {gap:g} s on both sides"
-        )
-    if trajectory is None and not tracked and all(np.array_equal(pose, poses[0]) for pose in poses):
+        raise DatasetError(f"{path}: none of its {count} scans can be read")
+    damaged = count - len(scans)
+    notes = [f"{damaged} of {count} scans dropped: damaged, or without a column"] if damaged else []
+    if trajectory is not None:
+        stamps = [scan.stamp for scan in scans]
+        posed, said_of = within_gap(stamps, at, gap, "scans", str(path), chosen.poses, trajectory.stamps)
+        scans, notes = [scans[i] for i, _ in posed], notes + said_of
+    elif not tracked and all(np.array_equal(pose, ends[0]) for pose in ends):
         notes.append(STANDS_STILL)
     return OusterScans(
         path.stem,
         beams.camera,
         notes,
-        dropped,
+        count - len(scans),
         path=path,
         source=source,
         sensor=chosen.sensor,
@@ -220,10 +220,8 @@ def _beams(path: Path, source: Any, sensor: int) -> Beams:
     infos = list(source.sensor_info)
     if not 0 <= sensor < len(infos):
         raise DatasetError(f"{path}: has {len(infos)} sensors, so there is no sensor {sensor}")
-    try:
+    with naming(f"{path}: sensor {sensor}"):
         return Beams.of(infos[sensor])
-    except DatasetError as error:
-        raise DatasetError(f"{path}: sensor {sensor}: {error}") from error
 
 
 def _of_sensor(frames: Any, sensor: int) -> Any | None:

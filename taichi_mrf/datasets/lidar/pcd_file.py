@@ -1,23 +1,81 @@
 """PCD, the point clouds of PCL: a header in text, then points as ASCII, binary, or binary packed by LZF.
 
 The packed values are ordered field by field, the others point by point. ``VIEWPOINT tx ty tz qw qx qy qz`` is
-the pose of the sensor.
+the pose of the sensor. LZF (M. Lehmann's libLZF), with which PCL packs points, is literal bytes, and repeats
+of earlier bytes.
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.lzf import LARGEST_RATIO, unpack
-from taichi_mrf.datasets.lidar.text_columns import text_columns
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import open_regular, read_bytes
 from taichi_mrf.system.memory import check_memory
+
+LARGEST_RATIO = 88
+"""Three bytes repeat up to 264."""
+
+
+def unpack_lzf(packed: bytes, size: int) -> bytes:
+    """The ``size`` bytes that are packed. Raises ValueError if they are others, or refer to what is not
+    there."""
+    out, at, end = bytearray(), 0, len(packed)
+    while at < end:
+        control = packed[at]
+        at += 1
+        if control < 32:  # control + 1 literal bytes follow
+            out += packed[at : at + control + 1]
+            at += control + 1
+            if at > end:
+                raise ValueError("it ends within a run of literal bytes")
+        else:  # a repeat of length + 2 bytes that begin distance + 1 bytes back
+            length = control >> 5
+            if length == 7 and at < end:
+                length += packed[at]
+                at += 1
+            if at >= end:
+                raise ValueError("it ends within a repeat")
+            first = len(out) - ((control & 31) << 8 | packed[at]) - 1
+            at += 1
+            if first < 0:
+                raise ValueError("a repeat begins before the first byte")
+            piece = out[first : first + length + 2]
+            while len(piece) < length + 2:  # a repeat may run into itself
+                piece += piece[: length + 2 - len(piece)]
+            out += piece
+        if len(out) > size:
+            break
+    if len(out) != size:
+        raise ValueError(f"it unpacks to {'more' if len(out) > size else 'fewer'} than {size} bytes")
+    return bytes(out)
+
+
+def text_columns(
+    path: Path, text: bytes, rows: int, wanted: Sequence[int], columns: int
+) -> NDArray[np.float64]:
+    """The ``wanted`` columns, (rows, len(wanted)), of the first ``rows`` lines that are not empty, each of
+    which has ``columns`` numbers. Raises DatasetError, which names the file and the row."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    if len(lines) < rows:
+        raise DatasetError(f"{path}: is cut short: {rows} points are expected, it has {len(lines)}")
+    found = np.empty((rows, len(wanted)))
+    for row, line in enumerate(lines[:rows]):
+        words = line.split()
+        if len(words) != columns:
+            raise DatasetError(f"{path}: point {row} has {len(words)} values, expected {columns}")
+        try:
+            found[row] = [float(words[column]) for column in wanted]
+        except ValueError:
+            raise DatasetError(f"{path}: point {row} contains something that is not a number") from None
+    return found
+
 
 _LONGEST_HEADER = 1 << 16
 _KINDS = {
@@ -58,10 +116,8 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], Pose]:
     """
     data = read_bytes(path, DatasetError)
     header = _header(path, data[:_LONGEST_HEADER])
-    try:
+    with naming(f"{path}: VIEWPOINT", KeyframeError):
         T_world_sensor = header.T_world_sensor()
-    except KeyframeError as error:
-        raise DatasetError(f"{path}: VIEWPOINT: {error}") from error
     missing = [axis for axis in "xyz" if axis not in (header.dtype.names or ())]
     if missing:
         raise DatasetError(f"{path}: FIELDS has no {', '.join(missing)}")
@@ -165,10 +221,8 @@ def _compressed(path: Path, header: PcdHeader, body: memoryview) -> NDArray[np.f
             f"{path}: claims to unpack {packed} bytes to {unpacked}; {header.points} points take {needed}"
         )
     check_memory(needed, f"{path}")
-    try:
-        data = unpack(bytes(body[8 : 8 + packed]), needed)
-    except ValueError as error:
-        raise DatasetError(f"{path}: its packed points are damaged: {error}") from error
+    with naming(f"{path}: its packed points are damaged", ValueError):
+        data = unpack_lzf(bytes(body[8 : 8 + packed]), needed)
     columns, start = {}, 0
     for name in header.dtype.names or ():
         kind = header.dtype[name]

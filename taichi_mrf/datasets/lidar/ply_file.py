@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.text_columns import text_columns
+from taichi_mrf.datasets.lidar.pcd_file import text_columns
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import open_regular, read_bytes
 

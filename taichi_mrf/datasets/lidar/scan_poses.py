@@ -16,7 +16,7 @@ from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.stereo.pairs import read_times
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, read_timed_poses
+from taichi_mrf.datasets.timed_poses import largest_gap, read_timed_poses, within_gap
 from taichi_mrf.datasets.trajectories import is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -160,10 +160,8 @@ def _stamp_of(cloud: Path) -> float | None:
 
 def _at_stamps(path: Path, stamps: dict[Path, float], options: ReadOptions) -> dict[Path, ScanPose]:
     """Each scan's pose, interpolated at its time, for those that have neighbours near enough."""
-    timed = read_timed_poses(path)
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
-    return {
-        cloud: ScanPose(stamp, partial(as_pose, pose), str(path))
-        for cloud, stamp in stamps.items()
-        if (pose := timed.at(stamp, gap)) is not None
-    }
+    timed, gap, clouds = read_timed_poses(path), largest_gap(options), list(stamps)
+    at = [timed.at(stamp, gap) for stamp in stamps.values()]
+    where = str(path)
+    posed, _ = within_gap(list(stamps.values()), at, gap, "scans", where, "by their names", timed.stamps)
+    return {clouds[i]: ScanPose(stamps[clouds[i]], partial(as_pose, pose), where) for i, pose in posed}

@@ -1,22 +1,78 @@
 """Lidar scans as frames: the reader behind every format of point clouds.
 
 A format only lists its scans; a scan's points are read and checked here. Points of an unknown pattern become
-free rays, one for each point, so every frame has a camera of its own, and depth is range.
+free rays, one for each point, so every frame has a camera of its own, and depth is range. What every lidar's
+recording says of its sensor is here too.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table
-from taichi_mrf.datasets.lidar.recording import LidarRecording
+from taichi_mrf.datasets.base import Dataset, Row, StatedSensor, Table
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
+
+LIDAR_SIGMA_M = 0.03
+"""Standard deviation of range that is assumed: spinning lidars are specified with 2 to 3 cm at all ranges."""
+
+LIDAR_PASS_THROUGH = 0.1
+"""Chance that a beam passes an occupied voxel. A lidar's voxels are wide, so posts and legs fill only a part
+of one (docs/decisions.md)."""
+
+_REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
+
+
+@dataclass
+class LidarRecording(Dataset):
+    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read."""
+
+    reach_m: float | None = field(default=None, kw_only=True)
+
+    def look_at_first(self, what: str) -> None:
+        """Set camera and reach from the first scan (``what``) that can be read. Raises DatasetError, which
+        says why the first cannot, if none can."""
+        problem: FrameError | None = None
+        for index in range(len(self)):
+            try:
+                frame = self.read(index)
+            except FrameError as error:
+                problem = problem or error
+                continue
+            self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
+            return
+        raise DatasetError(f"{self.name}: no {what} can be read: {problem}") from problem
+
+    @property
+    def stated(self) -> StatedSensor:
+        """What is assumed for every lidar, and the largest range of the first scan."""
+        return StatedSensor(
+            (LIDAR_SIGMA_M,),
+            origin="assumed for a lidar",
+            reach_m=self.reach_m,
+            pass_through=LIDAR_PASS_THROUGH,
+        )
+
+
+def reach_of(range_m: NDArray[np.floating]) -> float:
+    """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
+    of metres, and at most MOST_REACH_M. Warns if most go further."""
+    median_m = float(np.median(range_m[range_m > 0]))
+    if median_m > MOST_REACH_M:
+        warnings.warn(
+            f"half of the points of the first scan are further than {median_m:.0f} m: points are read as "
+            "metres, so divide them by 1000 if they are millimetres; else set sensor.max_depth",
+            stacklevel=3,
+        )
+    reach_m = np.quantile(range_m[range_m > 0], 0.999)
+    return float(min(max(1.0, np.ceil(reach_m / _REACH_STEP_M)) * _REACH_STEP_M, MOST_REACH_M))
+
 
 SECONDS_PER_SCAN = 0.1
 """Assumed where nothing tells: most lidars turn ten times a second."""

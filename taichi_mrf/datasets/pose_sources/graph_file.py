@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.timed_poses import quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.system.atomic import write_text
@@ -130,10 +130,8 @@ def _numbers(words: Sequence[str], first: int, count: int, where: str) -> NDArra
 
 def _pose(values: NDArray[np.float64], where: str) -> Pose:
     """The pose of x y z qx qy qz qw, or of x y z roll pitch yaw."""
-    try:
+    with naming(where, KeyframeError):
         return as_pose(pose_from_quaternion(values) if len(values) == 7 else _from_angles(values))
-    except KeyframeError as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def _from_angles(values: NDArray[np.float64]) -> Pose:

@@ -12,7 +12,7 @@ from taichi_mrf.datasets.conventions import AS_USUAL, Conventions
 from taichi_mrf.datasets.mended import origin_of, pose_of
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 
 SAME_STAMP_S = 5e-4
@@ -110,10 +110,8 @@ class FramePoses:
         return self._timed.at(stamp_s, self._gap_s)
 
     def _checked(self, key: object, T: object) -> Pose:
-        try:
+        with naming(f"{self.source.name}: the pose of {key}", KeyframeError):
             found = pose_of(as_pose(T), self.conventions)  # type: ignore[arg-type]
-        except KeyframeError as error:
-            raise DatasetError(f"{self.source.name}: the pose of {key}: {error}") from error
         if self.origin_m is None:
             self.origin_m = origin_of(found[:3, 3])
         found[:3, 3] -= self.origin_m

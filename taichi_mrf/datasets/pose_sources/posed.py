@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
-from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.derived import Chosen
 from taichi_mrf.datasets.mended import moved_note
 from taichi_mrf.datasets.pose_sources.base import PoseSource
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
@@ -23,26 +23,18 @@ from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass
-class PosedFrames(Derived):
+class PosedFrames(Chosen):
     """The frames of ``source`` at the poses of ``poses``. One without a pose there moves with the last frame
-    before it that has one. ``follows``: the poses change while the frames are mapped. ``kept`` are the
-    source's indices of the frames."""
+    before it that has one. ``follows``: the poses change while the frames are mapped."""
 
     poses: FramePoses = field(kw_only=True)
     follows: bool = False
-    kept: Sequence[int] = field(kw_only=True)
 
     def __post_init__(self) -> None:
         names = self.source.frame_names
-        self._names = [names[index] for index in self.kept]
         self._index_of = {name: index for index, name in enumerate(names)}
         self._recorded: dict[int, Pose] = {}
         self._carriers: tuple[int, NDArray[np.int64]] = (-1, np.zeros(0, np.int64))
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The source's, of the frames that are kept."""
-        return self._names
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -51,25 +43,16 @@ class PosedFrames(Derived):
 
     def pose(self, index: int) -> Pose:
         """The present pose of one frame. Raises what the source raises."""
-        kept = self.kept[index]
-        found = self.pose_now(self._names[index], float(self._stamps[kept]))
+        kept = self.indices[index]
+        found = self.pose_now(self.frame_names[index], float(self._stamps[kept]))
         return self.source.pose(kept) if found is None else found
-
-    def stamps(self) -> Sequence[float] | NDArray:
-        """The source's, of the frames that are kept."""
-        stamps = self.source.stamps()
-        return [stamps[index] for index in self.kept]
-
-    def sensor_of(self, index: int) -> str:
-        """The source's."""
-        return self.source.sensor_of(self.kept[index])
 
     def read(self, index: int) -> Frame:
         """The source's frame at its present pose. Raises what the source raises."""
-        if not 0 <= index < len(self.kept):
-            raise IndexError(f"{self.name} has {len(self.kept)} frames, there is no frame {index}")
-        frame = self.source.read(self.kept[index])
-        self._recorded[self.kept[index]] = frame.T_world_camera
+        if not 0 <= index < len(self.indices):
+            raise IndexError(f"{self.name} has {len(self.indices)} frames, there is no frame {index}")
+        frame = self.source.read(self.indices[index])
+        self._recorded[self.indices[index]] = frame.T_world_camera
         T_world_camera = self.pose_now(frame.name, frame.stamp)
         return frame if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
 
@@ -173,7 +156,7 @@ def posed_by(
         source=dataset,
         poses=poses,
         follows=follow,
-        kept=kept,
+        indices=kept,
     )
 
 

@@ -21,7 +21,13 @@ from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.realsense.motion import MotionModule, motion_or_note, recorded_motion
 from taichi_mrf.datasets.realsense.recorded import Player, RealSenseFrame, RealSenseRecording, aligned_images
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.datasets.timed_poses import (
+    INTERPOLATION_GAP,
+    TimedPoses,
+    largest_gap,
+    read_timed_poses,
+    within_gap,
+)
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -158,7 +164,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     from_file = not tracked and wanted.poses != STILL
     trajectory = read_timed_poses(Path(wanted.poses)) if from_file else None
     rs = library("pyrealsense2", f"{REALSENSE} needs", "realsense", DatasetError)
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    gap = largest_gap(options)
     source: RealSenseCamera | RealSenseRecording
     if wanted.imu not in ("", NO_IMU):
         raise DatasetError(f"{REALSENSE}{file}: imu may be {NO_IMU}, not {wanted.imu!r}")
@@ -257,24 +263,17 @@ def _open_recording(
             up = motion.up(images[0].stamp, clock, wait_s=0)
     still = start_pose(up)
     poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
-    posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
-    if not posed:
-        raise DatasetError(
-            f"{path}: none of its {len(images)} depth images ({images[0].stamp:.3f} to "
-            f"{images[-1].stamp:.3f} s) has poses within {gap:g} s on both sides"
-        )
-    dropped = len(images) - len(posed)
-    if dropped:
-        notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
+    stamps, known = [each.stamp for each in images], () if trajectory is None else trajectory.stamps
+    posed, dropped = within_gap(stamps, poses, gap, "depth images", str(path), "?poses=FILE", known)
     source = RealSenseRecording(
         path.stem,
         options.camera or player.camera,
-        notes=notes,
-        dropped=dropped,
+        notes=notes + dropped,
+        dropped=len(images) - len(posed),
         player=player,
         rows=[
             RealSenseFrame(f"realsense-{each.number:06d}", each.stamp, pose, str(path), each.number)
-            for each, pose in posed
+            for each, pose in ((images[i], pose) for i, pose in posed)
         ],
         gyro=gyro,
         acceleration=acceleration,

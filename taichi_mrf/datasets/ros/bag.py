@@ -32,7 +32,7 @@ from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import PoseChoice
 from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
-from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
+from taichi_mrf.datasets.ros.sensor import find_sensor, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
     choose,
@@ -42,7 +42,8 @@ from taichi_mrf.datasets.ros.topics import (
     no_depth,
     packed_otherwise,
 )
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.datasets.timed_poses import largest_gap
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -143,10 +144,8 @@ class RosBag(Table[BagRow]):
         """Decode one image, which must have its camera's size."""
         where = f"{self.reader.path}: topic {self.topic}"
         message = self.reader.read(self.topic, row.entry)
-        try:
+        with naming(where):
             depth_m = messages.depth_image(message, self.depth_scale)
-        except DatasetError as error:
-            raise DatasetError(f"{where}: {error}") from error
         camera = self.cameras.at(row.entry, depth_m.shape)
         if depth_m.shape != camera.shape:
             raise DatasetError(
@@ -284,8 +283,6 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     what = f"topics of depth images ({messages.ENCODINGS})"
     name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)
-    try:
+    with naming(f"{reader.path}: topic {name}"):
         messages.check_depth(topic.encoding)
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     return topic

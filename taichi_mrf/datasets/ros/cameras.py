@@ -13,7 +13,7 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
@@ -166,10 +166,8 @@ def _fitted(
 
 def _first_size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
     """(width, height) of a topic's first image."""
-    try:
+    with naming(f"{reader.path}: topic {depth.name}"):
         height, width = messages.depth_image(reader.first(depth.name), None).shape
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {depth.name}: {error}") from error
     return width, height
 
 

@@ -15,7 +15,7 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 COLOR_GAP = 0.035
@@ -42,10 +42,8 @@ class BagColors:
         if entry is None:
             return None
         message = self.reader.read(self.topic, entry)
-        try:
+        with naming(f"{self.reader.path}: topic {self.topic}"):
             color = messages.color_image(message)
-        except DatasetError as error:
-            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
         own = depth_camera if self.camera is None else self.camera.camera
         if color.shape[:2] != own.shape:
             raise DatasetError(
@@ -85,13 +83,20 @@ def find_colors(
     if isinstance(found, str):
         return None, [f"color: {name} is not used: {found}"]
     own, distortion = found
-    entries = sensor.run.of([entry for entry, _ in reader.messages(name)])
-    partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
-    paired = [None if partner is None else entries[partner] for partner in partners]
-    alone = sum(entry is None for entry in paired)
+    entries, alone = paired(sensor, name, stamps, gap)
     how = "registered to depth" if own is None else "brought to the depth camera's pixels"
-    notes = [f"color: {name}, {how}" + (f"; {alone} of {len(paired)} images have none" if alone else "")]
-    return BagColors(reader, name, paired, own, distortion), notes
+    return BagColors(reader, name, entries, own, distortion), [f"color: {name}, {how}{alone}"]
+
+
+def paired(
+    sensor: BagSensor, topic: str, stamps: Sequence[float], gap: float | None
+) -> tuple[list[Entry | None], str]:
+    """The images of a topic that belong to depth images of some stamps, and how many have none, in words."""
+    entries = sensor.run.of([entry for entry, _ in sensor.reader.messages(topic)])
+    partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
+    found = [None if partner is None else entries[partner] for partner in partners]
+    alone = found.count(None)
+    return found, f"; {alone} of {len(found)} images have none" if alone else ""
 
 
 def _color_topics(reader: RosReader) -> list[DepthTopic]:

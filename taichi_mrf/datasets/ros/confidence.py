@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.confidence import L515
-from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.color import COLOR_GAP
+from taichi_mrf.datasets.ros.color import paired
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 PART = "confidence"
@@ -44,10 +43,8 @@ class BagConfidence:
         if entry is None:
             return None
         message = self.reader.read(self.topic, entry)
-        try:
+        with naming(f"{self.reader.path}: topic {self.topic}"):
             return L515.sigma_m(_grades(messages.grey_image(message)), depth_m, camera)
-        except DatasetError as error:
-            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
 
 
 def find_confidence(
@@ -80,12 +77,8 @@ def find_confidence(
         name = fitting[0]
     if len(sensor.frames) > 1:
         return None, [f"confidence: {name} is not used: depth is of several sensors"]
-    entries = sensor.run.of([entry for entry, _ in reader.messages(name)])
-    partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
-    paired = [None if partner is None else entries[partner] for partner in partners]
-    alone = sum(entry is None for entry in paired)
-    rest = f"; {alone} of {len(paired)} images have none" if alone else ""
-    return BagConfidence(reader, name, paired), [f"confidence: {name}, as a sigma for each pixel{rest}"]
+    entries, alone = paired(sensor, name, stamps, gap)
+    return BagConfidence(reader, name, entries), [f"confidence: {name}, as a sigma for each pixel{alone}"]
 
 
 def _beside(name: str, depth: str) -> bool:

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Table
 from taichi_mrf.datasets.lidar.motion import Motion, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
-from taichi_mrf.datasets.lidar.recording import LidarRecording
-from taichi_mrf.datasets.lidar.scans import measured_points
+from taichi_mrf.datasets.lidar.scans import LidarRecording, measured_points
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
@@ -39,13 +38,11 @@ class LidarBag(LidarRecording, Table[BagRow]):
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one cloud, which must have a measurement."""
         message, entry = self.reader.read(self.topic, row.entry), row.entry
-        try:
+        with naming(f"{self.reader.path}: topic {self.topic}"):
             cloud = decode(message, entry.stamp)
             measured = measured_points(cloud.points_m)
             if not measured.any():
                 raise DatasetError(f"none of {measured.size} points is a measurement")
-        except DatasetError as error:
-            raise DatasetError(f"{self.reader.path}: topic {self.topic}: {error}") from error
         pose = T_world_camera
         if self.registered:
             own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]

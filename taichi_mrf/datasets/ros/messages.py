@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured, share_of_largest
-from taichi_mrf.datasets.ros.rvl import decode_rvl
+from taichi_mrf.datasets.images import (
+    PNG_SIGNATURE,
+    decode_16_bit,
+    decode_color,
+    measured,
+    share_of_largest,
+)
+from taichi_mrf.datasets.rvl import decode_rvl
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose

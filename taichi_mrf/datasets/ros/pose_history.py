@@ -35,7 +35,7 @@ from taichi_mrf.datasets.ros.topics import (
 )
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import as_pose
 
 CORRECTED = 1e-6
@@ -118,10 +118,8 @@ def _from_paths(
     """Each message of a Path is a version."""
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
-    try:
+    with naming(f"{reader.path}: topic {topic}"):
         body, _ = body_of(tree, optical, choice.body, topic, message_frame(reader, topic))
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {topic}: {error}") from error
     entries: Sequence[Entry] = [entry for entry, message in reader.messages(topic) if message.poses]
     if not entries:
         raise DatasetError(f"{reader.path}: topic {topic}: no message contains a pose")

@@ -26,7 +26,7 @@ from taichi_mrf.datasets.ros.tf import alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, path_topics, pose_topics
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 
 NO_POSES = (
@@ -189,10 +189,8 @@ def _from_topic(
     if optical and not choice.optical and tree.is_world_of(optical, parent, choice.body or child):
         return _of_odometry(tree, optical, parent, choice.body or child or "the sensor", timed, notes, name)
     fixed = choice.frame or parent
-    try:
+    with naming(f"{reader.path}: topic {name}"):
         body, body_note = body_of(tree, optical, choice.body or child, name, parent)
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     if choice.frame:
         must_connect(reader, tree, fixed, parent)
     notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{body_note}")

@@ -2,23 +2,60 @@
 
 It needs no ROS, and comes with the extra ``ros``. Its errors become
 DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
+
+rosbags gives messages by their time of recording. Where that is a simulation's, which starts again, the
+messages of two runs would come mixed; their places in the file keep them apart.
 """
 
 import re
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from taichi_mrf.datasets.base import Row
-from taichi_mrf.datasets.ros.file_order import Place, places_of
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
-from taichi_mrf.datasets.ros.tolerance import ROS1, files_of, msgtype_of, open_tolerantly
-from taichi_mrf.datasets.ros.unpacking import bound_unpacking
+from taichi_mrf.datasets.ros.tolerance import ROS1, bound_unpacking, files_of, msgtype_of, open_tolerantly
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_folder
 from taichi_mrf.system.libraries import library
+
+Place = tuple[int, int]
+"""The time of recording of a message in nanoseconds, and a number that grows along the recording."""
+
+
+def places_of(readers: Sequence[Any], topic: str, msgtype: str) -> list[Place]:
+    """The places of a topic's messages in the order in which rosbags gives them."""
+    found: list[tuple[int, int, int]] = []
+    for part, reader in enumerate(readers):
+        storage = getattr(reader, "storage", reader)
+        for file, each in enumerate(getattr(storage, "storages", [storage])):
+            ids = [c.id for c in each.connections if (c.topic, c.msgtype) == (topic, msgtype)]
+            before = max(part, file) << 128
+            found += [(file, time, before + place) for time, place in _places(each, ids)]
+    return [place for _, *place in sorted(found)]  # type: ignore[misc]
+
+
+def _places(file: Any, ids: Sequence[int]) -> Iterator[Place]:
+    """Of a ROS 1 bag by its index, of SQLite by the rows' numbers, of MCAP by the indices of its chunks."""
+    if hasattr(file, "indexes"):
+        yield from (
+            (each.time, (each.chunk_pos << 48) + each.offset) for key in ids for each in file.indexes[key]
+        )
+    elif hasattr(file, "dbconn"):
+        marks = ",".join("?" * len(ids))
+        rows = "SELECT timestamp, id FROM messages WHERE topic_id IN"
+        yield from file.dbconn.cursor().execute(f"{rows} ({marks})", tuple(ids))
+    else:
+        for chunk in file.chunks:
+            for key in set(ids) & set(chunk.message_index_offsets):
+                file.bio.seek(chunk.message_index_offsets[key] + 9)
+                _, size = struct.unpack("<HI", file.bio.read(6))
+                for time, offset in struct.iter_unpack("<QQ", file.bio.read(size)):
+                    yield time, (chunk.chunk_start_offset << 48) + offset
+
 
 LONGEST_PAUSE_S = 5.0
 """Between the files of a recording that was split while it ran."""

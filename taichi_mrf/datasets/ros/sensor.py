@@ -11,7 +11,7 @@ from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
 from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, apart_in_words
+from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 
@@ -107,34 +107,14 @@ def posed_by(
 ) -> tuple[Posed, list[str]]:
     """The messages that have a pose, and notes. Raises DatasetError if none has."""
     gap, entries = largest_gap(options), sensor.entries
-    posed = [
-        (i, entry, pose)
-        for i, entry in enumerate(entries)
-        if (pose := found[entry.frame].at(entry.stamp, gap)) is not None
-    ]
-    if not posed:
-        sources = "; ".join(dict.fromkeys(each.source for each in found.values()))
-        raise DatasetError(
-            f"{sensor.reader.path}: none of {len(entries)} {sensor.what} of {sensor.topic} "
-            f"({entries[0].stamp:.3f} to {entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides "
-            f"({sources})" + _why_none([entry.stamp for entry in entries], found, gap)
-        )
-    notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes)]
-    dropped = len(entries) - len(posed)
-    if dropped:
-        notes.append(
-            f"{dropped} of {len(entries)} {sensor.what} of {sensor.topic} dropped: no poses within {gap:g} s "
-            "on both sides"
-        )
-    return posed, notes
-
-
-def _why_none(stamps: Sequence[float], found: Mapping[str, BagPoses], gap: float) -> str:
-    """What keeps images and poses apart, and the remedy, in words."""
-    known = next((each.stamps for each in found.values() if len(each.stamps)), ())
-    return apart_in_words(stamps, known, gap)
-
-
-def largest_gap(options: ReadOptions) -> float:
-    """The largest time to a neighbouring pose, in seconds."""
-    return INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    posed, dropped = within_gap(
+        [entry.stamp for entry in entries],
+        [found[entry.frame].at(entry.stamp, gap) for entry in entries],
+        gap,
+        f"{sensor.what} of {sensor.topic}",
+        str(sensor.reader.path),
+        "; ".join(dict.fromkeys(each.source for each in found.values())),
+        next((each.stamps for each in found.values() if len(each.stamps)), ()),
+    )
+    notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes), *dropped]
+    return [(i, entries[i], pose) for i, pose in posed], notes

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import DatasetError, KeyframeError, said
+from taichi_mrf.errors import DatasetError, KeyframeError, naming, said
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.system.files import check_regular
@@ -177,7 +177,5 @@ class RtabmapDatabase:
         raise DatasetError(f"{self.path}: {what} does not hold {_POSE_NUMBERS} numbers")
 
     def _rigid(self, matrix: NDArray[np.float32], what: str) -> Pose:
-        try:
+        with naming(f"{self.path}: {what}", KeyframeError):
             return as_pose(matrix)
-        except KeyframeError as error:
-            raise DatasetError(f"{self.path}: {what}: {error}") from error

@@ -18,9 +18,8 @@ from taichi_mrf.datasets.images import decode_color, decode_unchanged, note_of_l
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
-from taichi_mrf.datasets.rtabmap.calibration import NodeCamera, node_camera
+from taichi_mrf.datasets.rtabmap.blobs import NodeCamera, decode_depth, depth_size, node_camera
 from taichi_mrf.datasets.rtabmap.database import LOOP_CLOSURES, Node, RtabmapDatabase
-from taichi_mrf.datasets.rtabmap.depth import decode_depth, depth_size
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera

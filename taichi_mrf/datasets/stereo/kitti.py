@@ -19,7 +19,7 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
 from taichi_mrf.datasets.trajectories import read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
 
@@ -118,11 +118,9 @@ def read_rig(path: Path, width: int, height: int) -> StereoRig:
         raise DatasetError(f"{path}: P0 and P1 differ in focal length or principal point: no rectified pair")
     if np.abs(P_left[:, 3]).max() > _SAME * fx or np.abs(P_right[1:, 3]).max() > _SAME * fx:
         raise DatasetError(f"{path}: P0 must be at the origin, and P1 moved along x alone")
-    try:
+    with naming(path, ConfigError):
         camera = PinholeCamera(width, height, float(fx), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
         return StereoRig(camera, baseline_m=-float(P_right[0, 3] / fx))
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def _read_projections(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from taichi_mrf.datasets.base import Row, Table
+from taichi_mrf.datasets.base import Row, StatedSensor, Table
 from taichi_mrf.datasets.images import image_size, read_color
 from taichi_mrf.datasets.stereo.confidence import disparity_sigma
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoRig, stereo_depth
@@ -42,14 +42,10 @@ class StereoPairs(Table[RecordedPair]):
     matching: StereoMatching = field(default_factory=StereoMatching)
 
     @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """lambda z^2, from the baseline and the focal length."""
-        return self.rig.sigma()
-
-    @property
-    def states_pixel_sigma(self) -> bool:
-        """By how sure the matching is, unless ``matching`` says otherwise."""
-        return self.matching.pixel_sigma
+    def stated(self) -> StatedSensor:
+        """lambda z^2, from the baseline and the focal length, and by how sure the matching is, unless
+        ``matching`` says otherwise."""
+        return StatedSensor(self.rig.sigma(), self.matching.pixel_sigma)
 
     @property
     def rig(self) -> StereoRig:

@@ -28,9 +28,9 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.datasets.timed_poses import largest_gap, read_timed_poses, within_gap
 from taichi_mrf.datasets.trajectories import read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -123,15 +123,13 @@ def _images(path: Path, side: str, pattern: str) -> list[Path]:
 
 
 def _rig(path: Path, described: RigFile, left: Sequence[Path], options: ReadOptions) -> StereoRig:
-    try:
+    with naming(path, ConfigError):
         if options.camera is not None:
             return StereoRig(options.camera, described.baseline)
         fy = described.fx if described.fy is None else described.fy
         own = (described.fx, fy, described.cx, described.cy)
         camera = PinholeCamera(*first_size(path, left), *(options.intrinsics or own))
         return StereoRig(camera, described.baseline)
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def _stamps(folder: Path, described: RigFile, left: Sequence[Path]) -> list[float] | None:
@@ -166,8 +164,11 @@ def _pairs(
     if trajectory.layout == "stamped":
         if stamps is None:
             raise DatasetError(f"{poses_file}: has stamps, but the images have none; add times: FILE")
-        timed = read_timed_poses(poses_file)
-        return _interpolated(poses_file, images, stamps, timed, options)
+        timed, gap = read_timed_poses(poses_file), largest_gap(options)
+        where, at = str(poses_file), [timed.at(stamp, gap) for stamp in stamps]
+        posed, notes = within_gap(stamps, at, gap, "stereo pairs", where, poses_file.name, timed.stamps)
+        pairs = [RecordedPair(images[i][0].stem, stamps[i], as_pose(T), where, *images[i]) for i, T in posed]
+        return pairs, notes, len(images) - len(pairs)
     if len(trajectory.poses) != len(images):
         raise DatasetError(
             f"{poses_file}: contains {len(trajectory.poses)} poses for {len(images)} stereo pairs"
@@ -181,30 +182,3 @@ def _pairs(
         for (left, right), stamp, pose in zip(images, stamps, trajectory.poses, strict=True)
     ]
     return pairs, notes, 0
-
-
-def _interpolated(
-    poses_file: Path,
-    images: Sequence[tuple[Path, Path]],
-    stamps: Sequence[float],
-    timed: TimedPoses,
-    options: ReadOptions,
-) -> tuple[list[RecordedPair], list[str], int]:
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
-    pairs = []
-    for (left, right), stamp in zip(images, stamps, strict=True):
-        pose = timed.at(stamp, gap)
-        if pose is not None:
-            pairs.append(RecordedPair(left.stem, stamp, as_pose(pose), str(poses_file), left, right))
-    dropped = len(images) - len(pairs)
-    if not pairs:
-        raise DatasetError(
-            f"{poses_file}: none of {len(images)} stereo pairs ({stamps[0]:.3f} to {stamps[-1]:.3f} s) has "
-            f"poses within {gap:g} s on both sides ({timed.stamps[0]:.3f} to {timed.stamps[-1]:.3f} s)"
-        )
-    notes = (
-        [f"{dropped} of {len(images)} pairs dropped: no poses within {gap:g} s on both sides"]
-        if dropped
-        else []
-    )
-    return pairs, notes, dropped

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf import PolynomialNoise
-from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
-from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh
+from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
 from taichi_mrf.evaluation.surface_scores import SurfaceTruth, surface_truth
 from taichi_mrf.experiments.exact import room_scene

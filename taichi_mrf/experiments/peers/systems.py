@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import Config, LogOddsMap
 from taichi_mrf.config.schema import SensorConfig
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
+from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
 from taichi_mrf.evaluation.accuracy import OUTLIERS
 from taichi_mrf.experiments.peers.our_maps import (

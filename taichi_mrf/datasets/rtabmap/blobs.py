@@ -1,18 +1,26 @@
-"""The camera of a node in a database of RTAB-Map, from the blob that describes it.
+"""The blobs of a node in a database of RTAB-Map: its camera, and its depth image.
 
-From version 0.18 on: 11 int32 (three of the version, 0 for a single camera or 1 for a stereo pair, width,
-height, and how many numbers of K, D, R, P and the local transform follow), then those as float64, the local
-transform as float32. Before: float32 fx, fy, cx, cy, perhaps width and height, and the local transform. That
-is the pose of the camera's optical frame on the robot. A node of several cameras has one after the other.
+Of a camera, from version 0.18 on: 11 int32 (three of the version, 0 for a single camera or 1 for a stereo
+pair, width, height, and how many numbers of K, D, R, P and the local transform follow), then those as
+float64, the local transform as float32. Before: float32 fx, fy, cx, cy, perhaps width and height, and the
+local transform. That is the pose of the camera's optical frame on the robot. A node of several cameras has
+one after the other.
+
+Depth images are PNGs of 16-bit millimetres, PNGs whose four 8-bit channels are the bytes of float32 metres,
+RVL (rvl.py) behind a name of 8 bytes, or inverse depth in 16 bits, as a PNG or as RVL.
 """
 
+import struct
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.image_header import PNG_SIGNATURE, claimed_size
+from taichi_mrf.datasets.images import decode_16_bit, decode_unchanged, measured
 from taichi_mrf.datasets.options import DISTORTION_COUNTS
-from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError
+from taichi_mrf.datasets.rvl import decode_rvl
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -46,10 +54,8 @@ class NodeCamera:
 def node_camera(blob: bytes, version: tuple[int, ...], where: str) -> NodeCamera:
     """A node's camera. Raises DatasetError, whose text begins with ``where``, for a damaged blob, a stereo
     pair and several cameras."""
-    try:
+    with naming(where, DatasetError, KeyframeError, ConfigError):
         return _with_header(blob) if version >= WITH_HEADER else _plain(blob)
-    except (DatasetError, KeyframeError, ConfigError) as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def _with_header(blob: bytes) -> NodeCamera:
@@ -112,3 +118,45 @@ def _camera(
         )
     lens = tuple(map(float, distortion)) if distortion.any() else ()
     return NodeCamera((fx, fy, cx, cy), (max(width, 0), max(height, 0)), lens, T_body_camera)
+
+
+RVL, INVERSE = b"DEPTHRVL", b"DEPTHINV"
+_RVL_HEADER = 16
+_PNG_KIND = 25
+"""The place of a PNG's type of colour: 6 is red, green, blue and opacity."""
+
+_MOST_NIBBLES = 11
+"""Of a whole number of 32 bits."""
+
+
+def depth_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) of a packed depth image, None for an unknown format or a damaged header."""
+    if data.startswith(INVERSE):
+        data = data[_RVL_HEADER:]
+    if data.startswith(RVL) and len(data) >= _RVL_HEADER:
+        width, height = struct.unpack_from("<2I", data, len(RVL))
+        return width, height
+    return claimed_size(data)
+
+
+def decode_depth(data: bytes, where: str, steps_per_metre: float) -> NDArray[np.float32]:
+    """Axial depth in metres, (H, W) float32, 0 for no measurement. ``steps_per_metre`` is for images of whole
+    numbers. Raises DatasetError, whose text begins with ``where``, for a damaged image."""
+    if data.startswith(INVERSE) and len(data) >= _RVL_HEADER:
+        a, b = struct.unpack_from("<2f", data, len(INVERSE))
+        steps = _whole(data[_RVL_HEADER:], where).astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            metres = np.where(steps > 0, np.float32(a) / (steps - np.float32(b)), np.float32(0))
+    elif data.startswith(PNG_SIGNATURE) and data[_PNG_KIND : _PNG_KIND + 1] == b"\6":
+        metres = np.ascontiguousarray(decode_unchanged(data, where)).view("<f4")[..., 0]
+    else:
+        metres = _whole(data, where).astype(np.float32) / np.float32(steps_per_metre)
+    return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0)).astype(np.float32)
+
+
+def _whole(data: bytes, where: str) -> NDArray[np.uint16]:
+    """The whole numbers of an image, (H, W)."""
+    if not data.startswith(RVL):
+        return decode_16_bit(data, where)
+    with naming(where):
+        return measured(decode_rvl(data[len(RVL) :]))

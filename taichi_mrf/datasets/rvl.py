@@ -11,8 +11,8 @@ from taichi_mrf.errors import DatasetError
 
 
 def decode_rvl(data: bytes) -> NDArray[np.uint16]:
-    """The image (H, W) behind two integers, width and height, as compressedDepth writes it. Raises
-    DatasetError if it is damaged."""
+    """The image (H, W) behind two integers, width and height, as ROS's compressedDepth and RTAB-Map write
+    it. Raises DatasetError if it is damaged."""
     if len(data) < 8:
         raise DatasetError("RVL data are cut short")
     width, height = struct.unpack_from("<II", data)
@@ -33,7 +33,10 @@ def decode_rvl(data: bytes) -> NDArray[np.uint16]:
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     steps = numbers[np.repeat(coded, count) + within]
     image = np.zeros(width * height, np.uint16)
-    image[np.repeat(pixels, count) + within] = np.cumsum((steps >> 1) ^ -(steps & 1)).astype(np.uint16)
+    values = np.cumsum((steps >> 1) ^ -(steps & 1))
+    if values.min(initial=0) < 0 or values.max(initial=0) > np.iinfo(np.uint16).max:
+        raise DatasetError("RVL data are damaged: a depth is out of range")
+    image[np.repeat(pixels, count) + within] = values.astype(np.uint16)
     return image.reshape(height, width)
 
 
