@@ -20,7 +20,7 @@ from taichi_mrf.evaluation.surface_scores import SurfaceScores, SurfaceTruth, su
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.peers.tsdf import BLOCK, MOST_BLOCKS
+from taichi_mrf.experiments.peers.systems import BLOCK, MOST_BLOCKS
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene
 from taichi_mrf.export.surface import smooth_surface
 from taichi_mrf.sensor.noise import NoiseModel

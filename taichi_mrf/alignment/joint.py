@@ -10,16 +10,17 @@ with T_i_k = inv(T_i) T_k, and e_i the twist from keyframe i's recorded pose. If
 that of the step from the keyframe before. recorded.py has the weights of the two terms.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Generator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.point_to_plane import PointToPlane
 from taichi_mrf.alignment.pose_equations import PoseEquations
 from taichi_mrf.alignment.recorded import KnownPoses
 from taichi_mrf.alignment.se3 import adjoint, moved
-from taichi_mrf.alignment.shared_views import SharedViews
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.surfels import surfels_of
 from taichi_mrf.geometry.poses import Pose, inverse
@@ -99,3 +100,32 @@ def _partners(points: Sequence[OrientedPoints], poses: Sequence[Pose]) -> list[t
     cells = [surfels_of(p.thinned(4), T, 2 * LEVELS[0][0]).keys for p, T in zip(points, poses, strict=True)]
     views = SharedViews(dict(enumerate(cells)))
     return [(i, k) for i, mine in enumerate(cells) for k in views.partners(mine, PARTNERS, SHARED, i)]
+
+
+class SharedViews:
+    """The cells (n,) that each keyframe has measured something in, by id."""
+
+    def __init__(self, cells: Mapping[int, NDArray[np.int64]] = {}) -> None:
+        self._seen_by: defaultdict[int, list[int]] = defaultdict(list)
+        for id, keys in cells.items():
+            self.add(id, keys)
+
+    def add(self, id: int, cells: NDArray[np.int64]) -> None:
+        """Add a keyframe that is not in the index."""
+        for key in cells.tolist():
+            self._seen_by[key].append(id)
+
+    def shares(self, cells: NDArray[np.int64]) -> dict[int, float]:
+        """The share of some cells that each keyframe has seen, if it has seen any."""
+        counts: defaultdict[int, int] = defaultdict(int)
+        for key in cells.tolist():
+            for id in self._seen_by.get(key, ()):
+                counts[id] += 1
+        return {id: count / len(cells) for id, count in counts.items()}
+
+    def partners(self, cells: NDArray[np.int64], most: int, least: float, without: int) -> list[int]:
+        """Those keyframes that have seen most of some cells, ``most`` of them at most, each at least the
+        share ``least``; not keyframe ``without``."""
+        shares = self.shares(cells)
+        known = [id for id, share in shares.items() if id != without and share >= least]
+        return sorted(known, key=lambda id: (-shares[id], -id))[:most]

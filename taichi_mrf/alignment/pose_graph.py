@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from taichi_mrf.alignment.pose_equations import PoseEquations
 from taichi_mrf.alignment.se3 import adjoint, cross_matrix
 from taichi_mrf.geometry.pose_edge import PoseEdge
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.poses import Pose, inverses
 
 Twists = NDArray[np.float64]
 """(n, 6): translations in metres, then rotation vectors in radians."""
@@ -110,7 +110,7 @@ class _Problem:
 
     def _errors(self, T: NDArray[np.float64]) -> Twists:
         """e of each edge."""
-        return _log(_inverse(self.Z) @ _inverse(T[self.first]) @ T[self.second])
+        return _log(inverses(self.Z) @ inverses(T[self.first]) @ T[self.second])
 
     def _squares(self, error: Twists) -> NDArray[np.float64]:
         """e' Omega e of each edge."""
@@ -128,7 +128,7 @@ class _Problem:
     def _step(self, error: Twists, trust: NDArray[np.float64], damping: float) -> Twists:
         """The damped step of every pose, (n, 6), 0 for those that are fixed."""
         # With T exp(xi), e changes by inv(J_r(e)) (xi_second - Ad(inv(T_second) T_first) xi_first).
-        to_first = -adjoint(_inverse(self.T[self.second]) @ self.T[self.first])
+        to_first = -adjoint(inverses(self.T[self.second]) @ self.T[self.first])
         J = _inverse_right_jacobian(error)
         weighted = trust[:, None, None] * np.swapaxes(J, -1, -2) @ self.information
         H, g = weighted @ J, np.einsum("nij,nj->ni", weighted, error)
@@ -143,15 +143,6 @@ def _inverse_right_jacobian(e: Twists) -> NDArray[np.float64]:
     ad[:, :3, :3] = ad[:, 3:, 3:] = cross_matrix(e[:, 3:])
     ad[:, :3, 3:] = cross_matrix(e[:, :3])
     return np.asarray(np.eye(6) + 0.5 * ad + ad @ ad / 12)
-
-
-def _inverse(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverses of (n, 4, 4) poses."""
-    out = np.zeros_like(T)
-    out[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
-    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], T[:, :3, 3])
-    out[:, 3, 3] = 1.0
-    return out
 
 
 def _exp(xi: Twists) -> NDArray[np.float64]:

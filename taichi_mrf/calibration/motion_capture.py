@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.calibration.chessboard import BoardView, corner_points
 from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
-from taichi_mrf.calibration.rigid_motions import rotations
 from taichi_mrf.calibration.time_lag import BodyPair, estimate_lag
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.geometry.poses import Pose, inverse, rotations
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _PARAMETERS = 13

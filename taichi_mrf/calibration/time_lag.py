@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.options import MotionCaptureConfig
-from taichi_mrf.calibration.rigid_motions import inverses, rotation_vectors
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import inverses, rotation_vectors
 
 LEAST_PAIRS = 10
 """Pairs of successive views of the board without which a lag is not sought."""

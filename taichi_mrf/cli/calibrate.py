@@ -10,8 +10,13 @@ from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.learning import calibrate
 from taichi_mrf.calibration.no_return import learn_no_return
-from taichi_mrf.calibration.report import calibration_report, remarks
-from taichi_mrf.calibration.results import CONFIG_FILE, write_noise, write_pictures
+from taichi_mrf.calibration.report import (
+    CONFIG_FILE,
+    calibration_report,
+    remarks,
+    write_noise,
+    write_pictures,
+)
 from taichi_mrf.calibration.truth_sources import (
     GroundTruth,
     from_chessboard,

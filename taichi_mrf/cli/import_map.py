@@ -13,7 +13,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.map_file import MapHeader
-from taichi_mrf.methods.recursive_storage import RecursiveContents, write_recursive
+from taichi_mrf.methods.recursive import RecursiveContents, write_recursive
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.sensor.noise import PolynomialNoise
 

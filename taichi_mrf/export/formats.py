@@ -1,9 +1,17 @@
-"""Writes a map in the format of a file's extension: the one list of all formats."""
+"""Writes a map in the format of a file's extension: the one list of all formats.
+
+An .npz file holds plain arrays, which NumPy alone can read.
+``voxels`` (n, 3) int32: coordinates of all known voxels; voxel i covers [i, i + 1) times ``voxel_size``, in
+metres, along each axis. ``probability`` (n,) float32: of being occupied. ``state`` (n,) int8: 1 free, 2
+occupied. ``free_bricks`` (k, 3) int32: free cubes of 8 voxels a side, whose voxels are not listed; brick i
+covers [8 i, 8 i + 8) voxels. ``prior``: the probability of unknown voxels. ``origin`` (3,): where
+the map's origin is in the recorded world, unless that is 0.
+"""
 
 import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +19,24 @@ from numpy.typing import NDArray
 from taichi_mrf.config.arguments import shown
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
-from taichi_mrf.export.arrays import write_arrays
 from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.fused_surface import SurfacedMap, has_surface, measured_surface
-from taichi_mrf.export.level_map import level_map
-from taichi_mrf.export.map_server import grey_image, write_map_server
-from taichi_mrf.export.mesh_file import write_mesh
+from taichi_mrf.export.map_server import grey_image, level_map, write_map_server
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.export.ply import write_voxels
-from taichi_mrf.export.surface import photographed, smooth_surface, voxel_surface
+from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
+from taichi_mrf.export.surface import Surface, photographed, smooth_surface, voxel_surface
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
 from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
-from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, probability
+from taichi_mrf.system.atomic import atomic_path, write_npz
 from taichi_mrf.system.libraries import library
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 _DEFAULTS = ExportOptions()
 
@@ -35,6 +45,8 @@ NO_SURFACE = (
     "anew with --keep-surface, or export from the map.npz of a run"
 )
 """Error for a missing measured surface, and its remedy."""
+
+_BYTES_PER_VOXEL = 40
 
 
 class ExportedMap(StorableMap, Protocol):
@@ -243,3 +255,73 @@ _WRITERS: dict[str, Writer] = {
     ".html": _page,
     SUFFIX: _chunks,
 }
+
+
+def write_mesh(
+    path: str | Path,
+    surface: Surface,
+    voxel_size: float,
+    T_gltf_world: Pose | None = None,
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
+) -> None:
+    """Write a surface in the format of the file's extension: .ply, .glb, .obj or .stl, which has no colours.
+
+    ``T_gltf_world`` is where the world stands in a .glb, in which y is up; the vertices stay in the world,
+    and the file's only node holds it. A .ply and an .obj have coordinates of the recorded world, in which the
+    map's origin is ``origin_m``; the numbers of the others are too short for a far one. Raises MapFileError,
+    and TaichiMRFError without trimesh for all but .ply.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".ply":
+        comments = [f"voxel_size {voxel_size:.9g} metres", surface.colors_note]
+        extra: dict[str, NDArray] = {}
+        if surface.normals is not None:
+            extra |= dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))
+        if surface.std_m is not None:
+            extra["std_m"] = surface.std_m
+        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, extra, comments, origin_m)
+        return
+    trimesh = library("trimesh", f"{suffix} files need", "mesh")
+    far = suffix == ".obj" and any(origin_m)
+    vertices_m = surface.vertices_m.astype(np.float64) + origin_m if far else surface.vertices_m
+    mesh = trimesh.Trimesh(
+        vertices_m, surface.triangles, vertex_normals=surface.normals,
+        vertex_colors=surface.colors, process=False, validate=False,
+    )  # fmt: skip
+    whole = mesh
+    if suffix == ".glb":
+        whole = trimesh.Scene()
+        transform = np.eye(4) if T_gltf_world is None else T_gltf_world
+        whole.add_geometry(mesh, node_name="map", geom_name="map", transform=transform)
+    content = whole.export(file_type=suffix[1:])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode("ascii") if isinstance(content, str) else content)
+
+
+def write_arrays(path: str | Path, m: QueriedMap) -> None:
+    """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
+    reader, deciding = BrickReader(m), BrickReader(m.decided)
+    count = len(reader.bricks) * VOXELS
+    check_memory(_BYTES_PER_VOXEL * count, f"{count / 1e6:.3g} million voxels as arrays")
+    voxels, probabilities, states = (
+        [np.zeros((0, 3), np.int32)],
+        [np.zeros(0, np.float32)],
+        [np.zeros(0, np.int8)],
+    )
+    for bricks, log_odds, _ in reader.batches(reader.bricks):
+        state = deciding.state(deciding.log_odds(bricks))
+        row, number = np.nonzero(state != UNKNOWN)
+        voxels.append(bricks[row] * BRICK + offsets_in_brick()[number])
+        probabilities.append(probability(log_odds[row, number]))
+        states.append(state[row, number])
+    arrays: dict[str, NDArray[Any]] = {
+        "voxels": np.concatenate(voxels),
+        "probability": np.concatenate(probabilities),
+        "state": np.concatenate(states),
+        "free_bricks": seen_free_bricks(m),
+        "voxel_size": np.asarray(m.voxel_size),
+        "prior": probability(np.array([reader.pool.prior_log_odds], np.float32)).reshape(()),
+    }
+    if any(m.config.volume.origin):
+        arrays["origin"] = np.array(m.config.volume.origin)
+    write_npz(path, arrays)

@@ -5,10 +5,11 @@ and poses. Each method stores its bricks itself. The manifest lists all members 
 a damaged or incomplete file is detected.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,14 @@ from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.methods.camera_file import NUMBERS, camera_arrays, read_cameras
-from taichi_mrf.methods.noise_file import evidence_arrays, noise_arrays, read_evidence, read_noise
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.distortion import DistortedCamera
+from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
+from taichi_mrf.sensor.pose_doubt import checked_covariance
+from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.topology import SparseTopology
@@ -39,6 +42,12 @@ PINHOLE_FORMAT = 2
 
 READABLE = (1, 2, 3)
 """The formats that can be read."""
+
+NUMBERS = "keyframe_camera_numbers"
+"""Files with cameras that are no pinholes have this member."""
+
+_CAMERA_ROWS = "keyframe_cameras"
+_CAMERA_ROW = 6
 
 
 @dataclass(frozen=True)
@@ -238,3 +247,125 @@ def _config(path: Path, file: NpzFile) -> Config:
         return from_dict(Config, parse_yaml(file.scalar("config", "U")), str(path))
     except ValueError as error:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
+
+
+def noise_arrays(noise: NoiseModel, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """A noise model as arrays by name. Raises MapFileError for one that cannot be saved."""
+    if isinstance(noise, PatchNoise):
+        arrays = noise.arrays()
+    elif isinstance(noise, PolynomialNoise):
+        arrays = {"sigma": noise.sigma, "bias": noise.bias}
+    else:
+        raise MapFileError(f"a noise model of type {type(noise).__name__} cannot be saved")
+    return {f"{prefix}noise_{name}": value for name, value in arrays.items()}
+
+
+def read_noise(file: NpzFile, prefix: str = "") -> NoiseModel:
+    """The noise model that :func:`noise_arrays` has made."""
+    prefix = f"{prefix}noise_"
+    if f"{prefix}patch" in file:
+        width, height, *rest = file.array(f"{prefix}camera", "fi", (6,)).tolist()
+        camera = PinholeCamera(int(width), int(height), *rest)
+        sigma, bias = (file.array(prefix + name, "f", (None, None)) for name in ("sigma", "bias"))
+        return PatchNoise(sigma, bias, file.scalar(f"{prefix}patch", "iu"), camera)
+    sigma, bias = (file.array(prefix + name, "f", (1, None))[0] for name in ("sigma", "bias"))
+    return PolynomialNoise(sigma, bias)
+
+
+def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
+    """Arrays of the evidence that a keyframe states; none if it states nothing."""
+    arrays = {} if own.noise is None else noise_arrays(own.noise, prefix)
+    if own.sigma_m is not None:
+        arrays[f"{prefix}sigma_m"] = own.sigma_m
+    if own.no_return is not None:
+        arrays[f"{prefix}no_return"] = own.no_return
+    if own.pose_covariance is not None:
+        arrays[f"{prefix}pose_covariance"] = own.pose_covariance
+    return arrays
+
+
+def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
+    """Evidence of a keyframe that :func:`evidence_arrays` has saved."""
+    noise = read_noise(file, prefix) if f"{prefix}noise_sigma" in file else None
+    sigma_m = None
+    if f"{prefix}sigma_m" in file:
+        sigma_m = file.array(f"{prefix}sigma_m", "f", camera.shape).astype(np.float32)
+    no_return = None
+    if f"{prefix}no_return" in file:
+        no_return = file.array(f"{prefix}no_return", "b", camera.shape)
+    covariance = None
+    if f"{prefix}pose_covariance" in file:
+        covariance = checked_covariance(file.array(f"{prefix}pose_covariance", "f", (6, 6)))
+    return OwnEvidence(noise, sigma_m, no_return, covariance)
+
+
+def camera_arrays(cameras: Sequence[Camera]) -> dict[str, NDArray]:
+    """The cameras of keyframes as arrays by name. Raises MapFileError for one that cannot be saved."""
+    if all(isinstance(camera, PinholeCamera) for camera in cameras):
+        rows = [_row(camera) for camera in cameras if isinstance(camera, PinholeCamera)]
+        return {_CAMERA_ROWS: np.array(rows, np.float64).reshape(-1, _CAMERA_ROW)}
+    distinct = {camera: number for number, camera in enumerate(dict.fromkeys(cameras))}
+    arrays: dict[str, NDArray] = {NUMBERS: np.array([distinct[camera] for camera in cameras], np.int64)}
+    for camera, number in distinct.items():
+        arrays |= {f"camera_{number}_{name}": values for name, values in _camera_arrays(camera).items()}
+    return arrays
+
+
+def read_cameras(file: NpzFile, keyframes: int) -> list[Camera]:
+    """The cameras that :func:`camera_arrays` has saved, one for each keyframe. Raises the file's error, and
+    ConfigError for values that are no camera's."""
+    if NUMBERS not in file:
+        return [_pinhole(row) for row in file.array(_CAMERA_ROWS, "fi", (keyframes, _CAMERA_ROW))]
+    numbers = file.array(NUMBERS, "i", (keyframes,)).tolist()
+    distinct = {number: _read_camera(file, f"camera_{number}_") for number in dict.fromkeys(numbers)}
+    return [distinct[number] for number in numbers]
+
+
+def _camera_arrays(camera: Camera) -> dict[str, NDArray]:
+    if isinstance(camera, PinholeCamera):
+        return {"pinhole": np.array(_row(camera))}
+    if isinstance(camera, SphericalCamera):
+        return {
+            "elevations_rad": camera.elevations_rad,
+            "azimuths_rad": camera.azimuths_rad,
+            "azimuth_offsets_rad": camera.azimuth_offsets_rad,
+        }
+    if isinstance(camera, DistortedCamera):
+        return {"pinhole": np.array(_row(camera.pinhole)), "distortion": camera.coefficients}
+    if isinstance(camera, RayTable):
+        name = "directions" if camera.has_pattern else "free_directions"
+        if camera.origins_m is None:
+            return {name: camera.table}
+        # Another name, so that versions without origins do not read the directions alone.
+        return {f"moving_{name}": camera.table, "origins_m": camera.origins_m}
+    raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
+
+
+def _read_camera(file: NpzFile, prefix: str) -> Camera:
+    if f"{prefix}pinhole" in file:
+        pinhole = _pinhole(file.array(f"{prefix}pinhole", "f", (_CAMERA_ROW,)))
+        if f"{prefix}distortion" in file:
+            return DistortedCamera(pinhole, file.array(f"{prefix}distortion", "f", (None,)))
+        return pinhole
+    if f"{prefix}elevations_rad" in file:
+        names = ("elevations_rad", "azimuths_rad", "azimuth_offsets_rad")
+        return SphericalCamera(*(file.array(prefix + name, "f", (None,)) for name in names))
+    if f"{prefix}directions" in file:
+        return RayTable(file.array(f"{prefix}directions", "f", (None, None, 3)))
+    if f"{prefix}origins_m" not in file:
+        return RayTable(file.array(f"{prefix}free_directions", "f", (1, None, 3))[0])
+    if f"{prefix}moving_free_directions" in file:
+        free = (f"{prefix}moving_free_directions", f"{prefix}origins_m")
+        return RayTable(*(file.array(name, "f", (1, None, 3))[0] for name in free))
+    directions = file.array(f"{prefix}moving_directions", "f", (None, None, 3))
+    origins_m = file.array(f"{prefix}origins_m", "f", (None, None, 3))
+    return RayTable(directions, origins_m[0] if len(origins_m) == 1 else origins_m)
+
+
+def _row(camera: PinholeCamera) -> list[float]:
+    return [float(camera.width), camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+
+
+def _pinhole(row: NDArray[np.float64]) -> PinholeCamera:
+    width, height, *rest = row.tolist()
+    return PinholeCamera(int(width), int(height), *rest)

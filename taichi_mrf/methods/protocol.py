@@ -1,6 +1,7 @@
 """The interface of all maps: what the rest of the program uses, whatever the method."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -12,13 +13,49 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
-from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.voxels.layout import CHUNK, VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """The size of a map. ``memory_mb`` counts voxels, messages, images and scratch memory;
+    ``bytes_per_voxel`` what grows with the voxels: their channels and all keyframes' messages."""
+
+    keyframes: int
+    frozen: int
+    rays: int
+    bricks: int
+    voxels: int
+    chunks: int
+    memory_mb: float
+    bytes_per_voxel: float
+
+
+def measure(
+    pool: BrickPool, *, keyframes: int, frozen: int, rays: int, message_bytes: int, other_bytes: int
+) -> MapStatistics:
+    """The statistics of a map; ``message_bytes`` is the memory of all messages, ``other_bytes`` what does not
+    grow with the voxels."""
+    in_use = pool.in_use
+    voxels = len(in_use) * VOXELS
+    of_voxels = pool.capacity * VOXELS * pool.bytes_per_voxel + message_bytes
+    return MapStatistics(
+        keyframes=keyframes,
+        frozen=frozen,
+        rays=rays,
+        bricks=len(in_use),
+        voxels=voxels,
+        chunks=len(np.unique(pool.bricks[in_use] // CHUNK, axis=0)),
+        memory_mb=(of_voxels + other_bytes) / 1e6,
+        bytes_per_voxel=of_voxels / max(voxels, 1),
+    )
 
 
 class PosedDepth(Protocol):

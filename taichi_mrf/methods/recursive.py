@@ -32,16 +32,23 @@ from taichi_mrf.inference.schedule import (
     driven,
 )
 from taichi_mrf.methods.brick_map import BrickMap, check_inference
-from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
+from taichi_mrf.methods.map_file import (
+    MapHeader,
+    StoredKeyframe,
+    naming,
+    open_map_file,
+    read_bricks,
+    read_header,
+)
+from taichi_mrf.methods.protocol import MapStatistics, measure
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS, fade_bricks
-from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.window import Window
@@ -325,3 +332,33 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         self._pool.revision += 1
         self._registry.topology.clear()
         self._registry.start_over()
+
+
+@dataclass(frozen=True)
+class RecursiveContents:
+    """The contents of such a file. ``belief`` (n, 512) are the log-odds of the ``bricks`` (n, 3); ``stale``
+    says that keyframes were removed or moved since they were computed."""
+
+    header: MapHeader
+    bricks: NDArray[np.int32]
+    belief: NDArray[np.float32]
+    stale: bool
+
+
+def write_recursive(path: Path, contents: RecursiveContents) -> None:
+    """Write the file under a temporary name and rename it into place. Raises MapFileError."""
+    arrays = {
+        **contents.header.arrays(),
+        "bricks": contents.bricks,
+        "belief": contents.belief,
+        "stale": np.asarray(contents.stale),
+    }
+    write_npz(path, arrays, manifest=True)
+
+
+def read_recursive(path: Path, method: str) -> RecursiveContents:
+    """Read a map of a method back. Raises MapFileError, which names the file and what is wrong."""
+    with open_map_file(path, method) as file:
+        return RecursiveContents(
+            read_header(path, file), *read_bricks(path, file), stale=file.scalar("stale", "b")
+        )

@@ -1,6 +1,6 @@
 """Rays as they were given, (N, 3) float32 or float64 in metres, or one origin or direction for all of them.
 
-CPU and CUDA read them where they are, as they do points (distance_reading.py): what float32 cannot hold of a
+CPU and CUDA read them where they are, as they do points (distance.py): what float32 cannot hold of a
 place far from the origin is subtracted in float64 on the way. Vulkan may lack float64, so the host does it.
 """
 

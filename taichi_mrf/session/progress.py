@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.methods.statistics import MapStatistics
+from taichi_mrf.methods.protocol import MapStatistics
 from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.viewer.messages import Status

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_room import VOXEL_SIZE, add, build, frames, probes
 
-from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
+from taichi_mrf.alignment.refine import log_likelihood, map_of_others
 from taichi_mrf.alignment.se3 import adjoint, moved, twist
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError

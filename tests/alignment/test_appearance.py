@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.alignment.appearance import Appearances, small_picture
-from taichi_mrf.alignment.shared_views import SharedViews
+from taichi_mrf.alignment.joint import SharedViews
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.sensor.frame import Frame
 

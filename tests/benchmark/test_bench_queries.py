@@ -11,7 +11,7 @@ from console import as_process
 from taichi_mrf import ExportOptions, cast_rays, export_map
 from taichi_mrf.benchmark import queries
 from taichi_mrf.benchmark.keyframe_cost import Seconds
-from taichi_mrf.cli.bench.query_tables import query_tables
+from taichi_mrf.cli.bench.run import query_tables
 from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError

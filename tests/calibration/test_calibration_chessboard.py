@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from taichi_mrf.calibration.board_images import find_boards, image_files
 from taichi_mrf.calibration.chessboard import board_depth, corner_points, find_board
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.calibration.rigid_motions import rotations
 from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.poses import rotations
 
 TIMES = np.arange(30) * 0.37
 

@@ -12,7 +12,7 @@ from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.learning import calibrate
 from taichi_mrf.calibration.noise_pictures import central_third
 from taichi_mrf.calibration.options import CalibrationConfig
-from taichi_mrf.calibration.results import write_pictures
+from taichi_mrf.calibration.report import write_pictures
 from taichi_mrf.calibration.samples import Cells
 from taichi_mrf.sensor.camera import PinholeCamera
 

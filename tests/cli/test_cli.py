@@ -20,9 +20,8 @@ from full_disk import files_up_to
 from new_interpreter import obey_hangups, output
 
 from taichi_mrf.cli.commands import COMMANDS
-from taichi_mrf.cli.flag_list import flags_of
 from taichi_mrf.cli.main import main
-from taichi_mrf.cli.parser import parse
+from taichi_mrf.cli.parser import flags_of, parse
 from taichi_mrf.config.schema import load
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import COMPILERS

@@ -11,7 +11,7 @@ from datasets_recordings import stamped_line
 from live_program import wait_for
 
 from taichi_mrf.cli.options.live import Live
-from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.cli.options.shared import PoseFlags
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.errors import ConfigError, DatasetError

@@ -12,8 +12,7 @@ from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.cli.map import run
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.options.noise_flags import NoiseFlags
-from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags
 from taichi_mrf.cli.shared import learn_noise
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import Dataset, open_dataset

@@ -10,7 +10,7 @@ from console import COARSE, ROOM, assert_refused, taichi_mrf
 from rich.table import Table
 
 import taichi_mrf as package
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import Verbosity
 from taichi_mrf.cli.shared import progress
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, printable

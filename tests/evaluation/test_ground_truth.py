@@ -12,8 +12,13 @@ from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 from taichi_mrf.errors import CapacityError, FrameError
-from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth, surface_voxels
-from taichi_mrf.evaluation.seen_voxels import SLACK, seen_voxels
+from taichi_mrf.evaluation.occupancy_truth import (
+    SLACK,
+    OccupancyTruth,
+    occupancy_truth,
+    seen_voxels,
+    surface_voxels,
+)
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.voxels.layout import BRICK, CHUNK

@@ -20,9 +20,8 @@ from taichi_mrf.experiments.ledger import Ledger
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.stereo import maps as stereo
 from taichi_mrf.experiments.stereo.artefact_curve import artefacts_at, curve, threshold_for
-from taichi_mrf.experiments.stereo.artefact_tables import ratio
 from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, updates_to
-from taichi_mrf.experiments.stereo.maps import log_likelihood
+from taichi_mrf.experiments.stereo.maps import log_likelihood, ratio
 from taichi_mrf.experiments.stereo.street import (
     RECORDING,
     Row,

@@ -19,7 +19,7 @@ from queried_maps import hand_map, map_of, room_map
 
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map, export_note, extensions
-from taichi_mrf.export.level_map import level_map
+from taichi_mrf.export.map_server import level_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.registry import load_map

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.methods.camera_file import camera_arrays
 from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.map_file import camera_arrays
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.methods.visibility.map import VisibilityMap

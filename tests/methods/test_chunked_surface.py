@@ -10,7 +10,7 @@ import trimesh
 from console import carry_out
 from queried_maps import room_map
 
-from taichi_mrf.cli.info_map import map_facts
+from taichi_mrf.cli.info import map_facts
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions

@@ -10,7 +10,7 @@ import small_room
 from ball_room import EVERYWHERE, SEEING, TIME, camera, near_ball, room_that_changed, views
 from console import carry_out
 
-from taichi_mrf.cli.info_map import map_facts
+from taichi_mrf.cli.info import map_facts
 from taichi_mrf.config.arguments import ArgumentTypeError
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.export.formats import export_map, extensions

@@ -18,8 +18,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
-from taichi_mrf.methods.log_odds.map import LogOddsMap
-from taichi_mrf.methods.log_odds.scan import ScanIntegrator, count_rays, weigh
+from taichi_mrf.methods.log_odds.map import LogOddsMap, ScanIntegrator, count_rays, weigh
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, log_odds
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.depth_effects import incidence
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.simulate import (
     KINECT_1,
     KINECT_1_LATERAL,
     SimulatedSensor,
+    incidence,
     simulate,
     simulate_model,
 )

@@ -24,7 +24,7 @@ from tracked_room import errors, nowhere, walk
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.cli.options.shared import PoseFlags
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses

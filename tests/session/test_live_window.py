@@ -7,7 +7,7 @@ from window_walk import add, windowed
 
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.session.baseline_overlay import BaselineOverlay
+from taichi_mrf.session.extras import BaselineOverlay
 from taichi_mrf.session.mapper import Mapper
 
 pytest.importorskip("zarr", reason="a window needs the extra store")

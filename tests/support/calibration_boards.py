@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.calibration.chessboard import BoardView, board_depth, camera_matrix, corner_points
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.calibration.rigid_motions import inverses, rotations
 from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.geometry.poses import inverses, rotations
 from taichi_mrf.sensor.camera import PinholeCamera
 
 CAMERA = PinholeCamera(width=320, height=240, fx=290, fy=292, cx=159.0, cy=120.5)

@@ -12,9 +12,8 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.viewer.tune.knob_widgets import config_value, shown_value
-from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
-from taichi_mrf.viewer.tune.parameters import find_parameter
+from taichi_mrf.viewer.tune.knobs import KNOBS, Knob, find_parameter
+from taichi_mrf.viewer.tune.panel import config_value, shown_value
 
 SLIDERS = [knob for knob in KNOBS if knob.range is not None]
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from taichi_mrf.export.page import add_cells
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.cell_clouds import add_cells
-from taichi_mrf.viewer.scene.look import look_of
 from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 
 PRIOR, VOXEL = -2.2, 0.1

@@ -19,9 +19,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.safe_text import LONGEST, in_html, in_markdown
+from taichi_mrf.viewer.transport.downloads import standalone_page
 from taichi_mrf.viewer.transport.process import AnyPage
 from taichi_mrf.viewer.transport.server import start_server
-from taichi_mrf.viewer.transport.standalone import standalone_page
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.page import TunePage
 from taichi_mrf.viewer.tune.scores import Scores

@@ -15,12 +15,11 @@ from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement
-from taichi_mrf.viewer.scene.look import look_of
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement, border
 from taichi_mrf.viewer.scene.options import OF_BELIEFS, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
-from taichi_mrf.viewer.scene.rings import border
+from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
 from taichi_mrf.voxels.colors import NO_COLOR, marginal_colors
 

@@ -12,7 +12,7 @@ from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Clicked
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.options import ViewOptions
-from taichi_mrf.viewer.scene.unlit_mesh import before_tone_mapping, unlit_glb
+from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
 from taichi_mrf.viewer.transport.server import start_server
 
 VOXEL = 0.1

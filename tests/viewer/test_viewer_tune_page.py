@@ -11,8 +11,8 @@ from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.transport.inbox import Used
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.tune import messages as t
-from taichi_mrf.viewer.tune.actions import Action, KnobMoved
 from taichi_mrf.viewer.tune.page import TunePage
+from taichi_mrf.viewer.tune.panel import Action, KnobMoved
 from taichi_mrf.viewer.tune.scores import Scores
 
 FIRST = Config(voxel_size=0.1)

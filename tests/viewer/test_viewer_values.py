@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from raw_viewer_client import RawClient, wait_for, widget_message
 
 from taichi_mrf.viewer.transport import connection
-from taichi_mrf.viewer.transport.widget_values import LARGEST_NUMBER, LONGEST_TEXT, is_same, value_to_set
+from taichi_mrf.viewer.transport.guard import LARGEST_NUMBER, LONGEST_TEXT, is_same, value_to_set
 
 if TYPE_CHECKING:
     from guarded_page import GuardedPage

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.options.noise_flags import NoiseFlags
-from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.calibration.options import CalibrationConfig
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import Verbosity
 from taichi_mrf.errors import ConfigError
 
 

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from taichi_mrf.cli.options.checks import check_least
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import Verbosity, check_least
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
 

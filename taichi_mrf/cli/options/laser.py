@@ -7,8 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from taichi_mrf.cli.options.checks import check_least
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import Verbosity, check_least
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.config import LaserConfig, Method

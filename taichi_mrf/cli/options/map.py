@@ -6,10 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from taichi_mrf.cli.options.checks import check_least
-from taichi_mrf.cli.options.noise_flags import NoiseFlags
-from taichi_mrf.cli.options.pose_flags import PoseFlags
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Verbosity, check_least
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError

@@ -19,7 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.options.shared import Verbosity
 from taichi_mrf.cli.shared.terminal import Terminal, printable
 from taichi_mrf.system import taichi_environment
 

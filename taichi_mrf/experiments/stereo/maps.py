@@ -9,23 +9,33 @@ import numpy as np
 
 from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.evaluation.accuracy import judge_view
-from taichi_mrf.evaluation.artefacts import sightings
+from taichi_mrf.evaluation.artefacts import LEAST_RAYS, MAJORITY, SIGMAS, Sightings, sightings
+from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.experiments.stereo.artefact_curve import curve, curve_figure, threshold_for
-from taichi_mrf.experiments.stereo.artefact_tables import COVERAGES, artefact_table, majority_table
-from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, growth_figure, growth_rows
-from taichi_mrf.experiments.stereo.scaling import (
+from taichi_mrf.experiments.stereo.artefact_curve import (
+    MAJORITIES,
+    artefacts_at,
+    curve,
+    curve_figure,
+    threshold_for,
+)
+from taichi_mrf.experiments.stereo.growth import (
     OCTOMAP,
     STRIDES,
+    corridor_scene,
+    grow,
+    growth_figure,
+    growth_rows,
     measured_methods,
     scaling_figure,
     time_mapping,
     time_octomap,
 )
 from taichi_mrf.experiments.stereo.street import (
+    PASSES,
     Row,
     mrf_of_street,
     octomap_style,
@@ -35,13 +45,13 @@ from taichi_mrf.experiments.stereo.street import (
     visibility,
     visibility_at_once,
 )
-from taichi_mrf.experiments.stereo.street_plan import plan, plan_figure
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 PICTURE_COVERAGE = 0.8
 """Share that the maps in the picture cover at least, if they can."""
@@ -55,6 +65,14 @@ GROWTH_EVERY = 2
 GROWTH_ON_STREET = (0.2, 0.4)
 SCALING_SIZES = (0.1, 0.2, 0.4)
 SCALING_VIEWS = 3
+COVERAGES = (0.9, 0.8, 0.7, 0.6)
+"""Coverages at which maps are compared."""
+
+PLAN_HEIGHTS_M = (-2.5, 4.0)
+"""Range of the colours, metres above the first camera; a car carries its cameras at 1.7 m."""
+
+ARTEFACT_COLOR = "#e6007e"
+"""Magenta: on none of the colour scales."""
 
 
 def run_stereo(experiment: Experiment) -> tuple[list[Table], list[Path]]:
@@ -205,3 +223,129 @@ def _scaling(experiment: Experiment, whole: Scene) -> "tuple[Table, Figure]":
     columns = ["voxels, resolution", "map", "seconds", "MB", "1000 known"]
     table = Table("stereo_fig5bc", "Figs. 5b, 5c: time and memory", columns, lines, notes, 3)
     return table, scaling_figure(results, methods)
+
+
+def artefact_table(name: str, results: Mapping[str, Result], scene: Scene, voxel_size: float) -> Table:
+    """One row for each map; the first is what the others are compared with."""
+    baseline = next(iter(results.values()))["curve"]
+    rows: list[list[Entry]] = []
+    for row, result in results.items():
+        swept = result["curve"]
+        half = next(i for i, threshold in enumerate(swept["threshold"]) if threshold >= 0.5)
+        line: list[Entry] = [row, swept["coverage"][half], swept["occupied"][half]]
+        line.append(swept["artefacts"][f"{MAJORITY:g}"][half])
+        for coverage in COVERAGES:
+            found = artefacts_at(swept, coverage)
+            line += [None if found is None else round(found), ratio(swept, baseline, coverage, MAJORITY)]
+        rows.append([*line, result.get("log_likelihood"), result["build_seconds"]])
+    columns = ["map", "coverage", "occupied", "artefacts"]
+    for coverage in COVERAGES:
+        columns += [f"at {coverage:g}", f"ratio at {coverage:g}"]
+    notes = [
+        f"{scene.name}: {len(scene.views[::2])} stereo pairs mapped at half resolution up to "
+        f"{scene.max_depth:g} m, {len(scene.views[1::2])} held out.",
+        "The first three figures are at P(O) >= 0.5, the others at equal coverage, with the ratio to the "
+        "first row; a dash: no threshold gives that.",
+        f"Artefact: of at least {LEAST_RAYS} held-out rays that pass or confirm an occupied voxel, at least "
+        f"{MAJORITY:.0%} measure a surface more than {SIGMAS:g} sigma behind it.",
+        f"Coverage: held-out measurements with an occupied voxel on their ray within {SIGMAS:g} sigma and a "
+        "voxel size.",
+        "Log-likelihood: mean log density, per metre, of the held-out measurements under the map and the "
+        "noise that it was made with.",
+        f"'{PASSES} passes': the pairs are integrated one after the other, and that {PASSES} times. "
+        "'At once': unknown voxels stop no ray.",
+    ]
+    title = f"Artefacts of stereo maps, {voxel_size:g} m"
+    return Table(name, title, [*columns, "log-likelihood", "seconds"], rows, notes, 2)
+
+
+def majority_table(name: str, results: Mapping[str, Result]) -> Table:
+    """The ratio to the first row under milder and stricter majorities."""
+    baseline = next(iter(results.values()))["curve"]
+    cases = [(majority, coverage) for majority in MAJORITIES for coverage in COVERAGES[:2]]
+    rows: list[list[Entry]] = [
+        [row, *(ratio(result["curve"], baseline, coverage, majority) for majority, coverage in cases)]
+        for row, result in results.items()
+    ]
+    columns = ["map", *(f"{majority:.0%} of rays, at {coverage:g}" for majority, coverage in cases)]
+    notes = ["Artefacts in relation to those of the first row, by the share of rays that makes one."]
+    return Table(name, "What counts as seen through", columns, rows, notes, 2)
+
+
+def ratio(swept: Result, baseline: Result, coverage: float, majority: float) -> float | None:
+    """Artefacts of one curve for one of the baseline's; None if either has none to compare."""
+    found = artefacts_at(swept, coverage, majority)
+    theirs = artefacts_at(baseline, coverage, majority)
+    return found / theirs if found is not None and theirs else None
+
+
+def plan(seen: Sightings, scene: Scene, voxel_size: float, occupied_from: float) -> Result:
+    """The columns of occupied voxels in the frame of the first camera, which looks ahead along a level
+    street: ``ahead`` and ``right`` in voxels, ``top`` the height of the highest one in metres, and whether
+    any is an ``artefact``."""
+    T = scene.views[0].T_world_camera
+    occupied = seen.probability >= occupied_from
+    right, down, ahead = ((seen.centres[occupied] - T[:3, 3]) @ T[:3, :3]).T
+    cells = np.floor(np.stack([ahead, right], axis=1) / voxel_size).astype(np.int64)
+    columns, column_of = np.unique(cells, axis=0, return_inverse=True)
+    column_of = column_of.reshape(-1)
+    top = np.full(len(columns), -np.inf)
+    np.maximum.at(top, column_of, -down)
+    artefact = np.zeros(len(columns), bool)
+    np.logical_or.at(artefact, column_of, seen.artefacts()[occupied])
+    return {
+        "ahead": columns[:, 0].tolist(),
+        "right": columns[:, 1].tolist(),
+        "top": [round(float(t), 1) for t in top],
+        "artefact": artefact.astype(int).tolist(),
+        "artefacts": int(seen.artefacts()[occupied].sum()),
+        "coverage": seen.coverage(occupied_from),
+        "occupied_from": occupied_from,
+    }
+
+
+def plan_figure(plans: Mapping[str, Result], scene: Scene, voxel_size: float) -> "Figure":
+    """A panel for each map, the street ahead to the right; artefacts are drawn larger than they are."""
+    from matplotlib import colormaps
+
+    ahead = np.concatenate([np.asarray(p["ahead"], float) for p in plans.values()])
+    right = np.concatenate([np.asarray(p["right"], float) for p in plans.values()])
+    if not len(ahead):
+        ahead = right = np.zeros(1)
+    # A few far voxels would make all others small.
+    (x_low, x_high), (y_low, y_high) = (np.quantile(v, [0.002, 0.998]) for v in (ahead, right))
+    shape = (int(y_high - y_low) + 1, int(x_high - x_low) + 1)
+    extent = (x_low * voxel_size, (x_high + 1) * voxel_size, (y_high + 1) * voxel_size, y_low * voxel_size)
+    height_in = max(1.2, 11.0 * shape[0] / shape[1])
+    figure = new_figure(12.5, (height_in + 0.45) * len(plans) + 0.6)
+    axes_of_all = figure.subplots(len(plans), 1, squeeze=False, sharex=True)[:, 0]
+    T = scene.views[0].T_world_camera
+    way = np.array([(view.T_world_camera[:3, 3] - T[:3, 3]) @ T[:3, :3] for view in scene.views[::2]])
+    for axes, (name, drawn) in zip(axes_of_all, plans.items(), strict=True):
+        image = np.full(shape, np.nan)
+        row = (np.asarray(drawn["right"], float) - y_low).astype(int)
+        column = (np.asarray(drawn["ahead"], float) - x_low).astype(int)
+        inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+        image[row[inside], column[inside]] = np.asarray(drawn["top"], float)[inside]
+        shown = axes.imshow(
+            image, extent=extent, cmap=colormaps["viridis"], vmin=PLAN_HEIGHTS_M[0], vmax=PLAN_HEIGHTS_M[1],
+            interpolation="nearest",
+        )  # fmt: skip
+        wrong = inside & np.asarray(drawn["artefact"], bool)
+        axes.plot(
+            (np.asarray(drawn["ahead"])[wrong] + 0.5) * voxel_size,
+            (np.asarray(drawn["right"])[wrong] + 0.5) * voxel_size,
+            ".", color=ARTEFACT_COLOR, markersize=2.5,
+        )  # fmt: skip
+        axes.plot(way[:, 2], way[:, 0], "-", color="black", linewidth=1.0)
+        axes.set(
+            title=f"{name}: {drawn['artefacts']} artefacts (magenta) at P >= {drawn['occupied_from']:.2f}, "
+            f"which covers {100 * drawn['coverage']:.0f} %",
+            xlim=extent[:2], ylim=extent[2:],
+        )  # fmt: skip
+    axes_of_all[-1].set_xlabel("metres ahead; black: way of the camera")
+    figure.colorbar(
+        shown, ax=list(axes_of_all), location="bottom", shrink=0.5, aspect=40, pad=0.01,
+        label="highest voxel (m above the camera)",
+    )  # fmt: skip
+    return figure

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
-from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.alignment.refine import Aligner, RefinedPose, log_likelihood, map_of_others
 from taichi_mrf.config.arguments import real
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError

@@ -23,7 +23,7 @@ from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.layers import layer_of
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, MadeOf, WithSurface
-from taichi_mrf.methods.statistics import MapStatistics, measure
+from taichi_mrf.methods.protocol import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti

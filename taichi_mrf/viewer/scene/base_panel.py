@@ -1,14 +1,13 @@
 """The widgets that both pages have: what is being done, counts, legend, notices; and how widgets of an action
 are added."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 import viser
 
 from taichi_mrf.viewer.messages import Notice
-from taichi_mrf.viewer.scene.notices import notices_html
 from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.safe_text import in_html
 from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
@@ -23,6 +22,15 @@ _COUNTED = {
     "baseline": "of the baseline",
 }
 """Layers that are counted beside voxels or the surface, and their words."""
+
+_SEVERITY_COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
+_POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
+    "info": "blue",
+    "warning": "yellow",
+    "error": "red",
+}
+_POP_UP_S = 8.0
+_LONGEST_POP_UP = 500
 
 
 class BasePanel:
@@ -118,3 +126,21 @@ def rows_html(rows: Mapping[str, str]) -> str:
         for name, value in rows.items()
     )
     return f'<table style="margin:0 0.75em;font-size:0.85em;border-spacing:0.5em 0">{cells}</table>'
+
+
+def notices_html(notices: Iterable[Notice]) -> str:
+    """A paragraph for each notice, in the order given and the colour of its severity."""
+    lines = "".join(
+        f'<p style="margin:0.2em 0;color:{_SEVERITY_COLORS[each.severity]}">{in_html(each.text)}</p>'
+        for each in notices
+    )
+    return f'<div style="margin:0.5em 0.75em;font-size:0.85em">{lines}</div>'
+
+
+def pop_up(server: viser.ViserServer, notice: Notice) -> None:
+    """Show a notice for some seconds in every browser."""
+    title = "Something went wrong" if notice.severity == "error" else "Note"
+    color = _POP_UP_COLORS[notice.severity]
+    text = notice.text[:_LONGEST_POP_UP]
+    for client in server.get_clients().values():
+        client.add_notification(title, text, auto_close_seconds=_POP_UP_S, color=color)

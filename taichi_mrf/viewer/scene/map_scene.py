@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
-from taichi_mrf.viewer.scene.brick_lines import BrickLines
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
-from taichi_mrf.viewer.scene.look import Look, look_of
 from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
-from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
+from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, look_of
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 
@@ -31,6 +29,8 @@ _GAP_M = 0.5
 
 
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
+_OUTLINE_COLOR = (120, 120, 120)
+_OUTLINE_NODE = "/bricks"
 
 
 class MapScene:
@@ -217,3 +217,44 @@ class MapScene:
             axis = 0 if up[0] != 0 else 1
             shift[axis] = (bounds[1] - bounds[0] + 1)[axis] * BRICK * self._hello.voxel_size + _GAP_M
         return shift
+
+
+def brick_edges(bricks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Edges (n, 2, 3) of the bricks (m, 3), as lattice points; an edge that several bricks share is listed
+    once."""
+    edges = []
+    for axis in range(3):
+        others = [other for other in range(3) if other != axis]
+        for a in (0, 1):
+            for b in (0, 1):
+                start = bricks.copy()
+                start[:, others[0]] += a
+                start[:, others[1]] += b
+                edges.append(np.column_stack([start, np.full(len(bricks), axis)]))
+    unique = np.unique(np.concatenate(edges), axis=0)
+    start, axes = unique[:, :3], unique[:, 3]
+    return np.stack([start, start + np.eye(3, dtype=np.int64)[axes]], axis=1)
+
+
+class BrickLines:
+    """Owns the lines in the scene."""
+
+    def __init__(self, scene: viser.SceneApi, voxel_size: float) -> None:
+        self._scene, self._voxel_size = scene, voxel_size
+        self._node: viser.LineSegmentsHandle | None = None
+
+    def show(self, bricks: NDArray[np.int64] | None) -> None:
+        """Draw the outlines of bricks (n, 3); no bricks, or None, remove them."""
+        if bricks is None or not len(bricks):
+            self.hide()
+            return
+        lines = (brick_edges(bricks) * BRICK * self._voxel_size).astype(np.float32)
+        self._node = self._scene.add_line_segments(
+            _OUTLINE_NODE, lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
+        )
+
+    def hide(self) -> None:
+        """Remove the lines from the scene."""
+        if self._node is not None:
+            self._node.remove()
+            self._node = None

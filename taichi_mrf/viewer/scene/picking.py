@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.viewer.messages import KeyframeInfo
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M
-from taichi_mrf.viewer.scene.rings import hits_of_sphere, on_sphere
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, hits_of_sphere, on_sphere
 
 
 @dataclass(frozen=True)

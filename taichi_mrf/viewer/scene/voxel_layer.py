@@ -6,9 +6,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, Scale, voxel_colors
+from taichi_mrf.geometry.up import Up
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, Scale, scale_of, voxel_colors
+from taichi_mrf.viewer.scene.cut_plane import cut_voxel
+from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
-from taichi_mrf.voxels.layout import CHUNK_VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS
 
 NOTICEABLE = 12
 """A change of colour of at most this (of 255, in any channel) is not sent until no more updates come."""
@@ -178,3 +181,34 @@ class VoxelLayer:
     def _position(self, key: ChunkKey) -> NDArray[np.float64]:
         """Position of the centre of the chunk's first voxel, the origin of its points, in metres, world."""
         return self.origin_m + (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
+
+
+def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
+    """How the voxels of a map look."""
+    cut = None
+    if options.cut_axis != "none":
+        cut = cut_voxel(store, "xyz".index(options.cut_axis), options.cut_at)
+    return Look(
+        log_odds=float(np.log(options.threshold / (1 - options.threshold))),
+        cut=cut,
+        scale=scale_of(
+            options.color_by,
+            options.threshold,
+            _heights_m(store, up, voxel_size),
+            store.most_seen() if options.color_by == "keyframes" else 1,
+        ),
+        point_size=options.size,
+        shade=options.shade,
+        dynamic=options.dynamic,
+        up=up,
+    )
+
+
+def _heights_m(store: VoxelStore, up: Up, voxel_size: float) -> tuple[float, float]:
+    """Heights of the lower side of the lowest brick and of the upper side of the highest, in metres."""
+    bounds = store.bounds()
+    if bounds is None:
+        return 0.0, 1.0
+    axis, sign = up
+    ends = sign * BRICK * voxel_size * np.array([bounds[0][axis], bounds[1][axis] + 1])
+    return float(ends.min()), float(ends.max())

@@ -1,5 +1,8 @@
 """Files that a browser gets from the page: pictures, standalone pages, recordings."""
 
+import base64
+import hashlib
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -9,8 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import viser
+from viser.infra import StateSerializer
 
-from taichi_mrf.viewer.transport.standalone import standalone_page
+from taichi_mrf.errors import ViewerError
+from taichi_mrf.viewer.transport.viser_internals import HERE, page_script_hashes
 
 PICTURE_TIMEOUT_S = 30.0
 """How long a browser may take to draw and send a picture."""
@@ -20,6 +25,14 @@ PICTURES_AT_ONCE = 8
 
 MOST_PIXELS = 2560 * 1600
 """Of a picture; larger windows are scaled down."""
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'wasm-unsafe-eval' {scripts}; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:; "
+    "base-uri 'none'; form-action 'none'"
+)
+"""The file runs only viser's scripts, even if the scene holds text with scripts in it, and loads nothing from
+a network."""
 
 
 class Downloads:
@@ -116,3 +129,17 @@ class Downloads:
         finally:
             with self._lock:
                 self._begun.discard((client, kind))
+
+
+def standalone_page(scene: StateSerializer, dark: bool) -> str:
+    """The HTML of a scene. Raises ViewerError if viser's page is not built as this package knows it."""
+    html = scene.as_html(dark)
+    begin, end = html.find("<script>window.__VISER_EMBED_DATA__="), html.find("</script></head>")
+    head = re.search(r"<head[^>]*>", html[: max(begin, 0)])
+    if head is None or begin > end:
+        raise ViewerError(f"cannot protect viser's standalone page: it has changed; mend {HERE}")
+    data = html[begin + len("<script>") : end].encode()
+    digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
+    policy = PAGE_POLICY.format(scripts=" ".join([*page_script_hashes(), f"'sha256-{digest}'"]))
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    return html[: head.end()] + meta + html[head.end() :]

@@ -15,8 +15,7 @@ from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.transport.inbox import Inbox
 from taichi_mrf.viewer.tune import messages as t
-from taichi_mrf.viewer.tune.actions import Action, KnobMoved
-from taichi_mrf.viewer.tune.panel import TunePanel
+from taichi_mrf.viewer.tune.panel import Action, KnobMoved, TunePanel
 
 
 class TunePage(BasePage[TunePanel]):

@@ -1,24 +1,52 @@
-"""The widgets of the tuning page. page.py decides what they do."""
+"""The widgets of the tuning page, with the sliders of parameters and the table of all tries. page.py decides
+what they do.
 
-from collections.abc import Sequence
-from typing import Any
+A slider has steps and the configuration has not: only the widget that a user has moved changes its parameter.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Annotated, Any
 
 import numpy as np
 import viser
 
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
 from taichi_mrf.viewer.scene.options import OF_BELIEFS, ViewOptions
-from taichi_mrf.viewer.scene.safe_text import in_markdown
-from taichi_mrf.viewer.scene.widgets import OptionWidgets
-from taichi_mrf.viewer.tune.actions import Action, KnobMoved
-from taichi_mrf.viewer.tune.knob_widgets import KnobWidgets
-from taichi_mrf.viewer.tune.knobs import KNOBS
+from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget
+from taichi_mrf.viewer.transport.inbox import Event
+from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 from taichi_mrf.viewer.tune.messages import Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.noise_plot import NoisePlot
 from taichi_mrf.viewer.tune.score_board import score_board_html
-from taichi_mrf.viewer.tune.table import changes, table_html
+from taichi_mrf.viewer.tune.scores import KINDS
+
+
+class Action(Enum):
+    """A button, or a widget whose value asks the tuning process for something."""
+
+    STOP_SEARCH = auto()
+    USE_FRAMES = auto()
+    CHOOSE_VIEW = auto()
+    RESTORE = auto()
+    PIN = auto()
+    SAVE_YAML = auto()
+    SAVE_CSV = auto()
+
+
+@dataclass(frozen=True)
+class KnobMoved(Event):
+    """The slider or box of the parameter of this name was used."""
+
+    name: str
+
 
 TRY_BUTTONS = {"Restore": Action.RESTORE, "Pin": Action.PIN}
 SAVE_BUTTONS = {
@@ -39,6 +67,16 @@ _FOLDERS = {"map": "Map", **_OWN, "keyframes": "Keyframes"}
 _FOLDED = ("keyframes",)
 _MOST_TRIES = 200
 """Of the latest tries, how many the dropdown offers."""
+
+LEAST_DECADE = 1e-300
+"""Shown in place of 0 by a slider of powers of ten."""
+
+MOST_ROWS = 150
+"""Of the table of tries."""
+
+_TABLE_COLUMNS = ("accuracy_sigma", "median_abs_m", "log_likelihood", "depth_calibration", "seconds")
+_TABLE_HEADS = ("1.5 σ", "median", "log-lik.", "calib.", "time")
+_TABLE_MARKS = {"search": "◆", "hand": "", "start": ""}
 
 
 class TunePanel(BasePanel):
@@ -206,3 +244,122 @@ class TunePanel(BasePanel):
             "**Restore** sets the sliders to the selected try and maps with it again. **Pin** makes it the "
             "reference (A): scores and pictures of other tries are compared with it."
         )
+
+
+class KnobWidgets:
+    """One widget for each of some knobs, added where the GUI stands. ``moved`` is called, on any thread, with
+    the name of a knob that a user has moved."""
+
+    def __init__(
+        self, gui: viser.GuiApi, knobs: Sequence[Knob], config: Config, moved: Callable[[str], None]
+    ) -> None:
+        self._knobs = {knob.name: knob for knob in knobs}
+        self._handles: dict[str, Any] = {}
+        for knob in knobs:
+            value = shown_value(knob, config)
+            hint = knob.parameter.hint
+            if knob.range is not None:
+                hint = Annotated[hint, knob.range]
+            handle = add_widget(gui, knob.label, hint, value, f"{knob.parameter.help} ({knob.name})")
+            handle.on_update(
+                lambda event, name=knob.name: moved(name) if event.client_id is not None else None
+            )
+            self._handles[knob.name] = handle
+        self.follow(config)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._knobs
+
+    def applied(self, name: str, config: Config) -> Config:
+        """The configuration with one parameter as its widget shows it. Raises ConfigError if the result is
+        not valid."""
+        knob = self._knobs[name]
+        return knob.parameter.replaced(config, config_value(knob, self._handles[name].value))
+
+    def show(self, config: Config) -> None:
+        """Set all widgets to a configuration's values."""
+        for name, knob in self._knobs.items():
+            value = shown_value(knob, config)
+            if self._handles[name].value != value:
+                self._handles[name].value = value
+        self.follow(config)
+
+    def follow(self, config: Config) -> None:
+        """Show the widgets of parameters that have an effect under this configuration, hide the others."""
+        for name, knob in self._knobs.items():
+            visible = knob.applies(config)
+            if self._handles[name].visible != visible:
+                self._handles[name].visible = visible
+
+
+def shown_value(knob: Knob, config: Config) -> Any:
+    """Value that a knob's widget shows: the parameter's or its power of ten, clamped to the range."""
+    value = knob.value_of(config)
+    if knob.range is None:
+        return value
+    if value is None:
+        return knob.range.least
+    if knob.decades:
+        value = math.log10(max(value, LEAST_DECADE))
+    within = min(max(value, knob.range.least), knob.range.most)
+    return int(within) if knob.parameter.hint is int else round(float(within), 9)
+
+
+def config_value(knob: Knob, shown: Any) -> Any:
+    """The parameter's value for what a widget shows."""
+    return float(f"{10.0**shown:.4g}") if knob.decades else shown
+
+
+def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) -> str:
+    """A row of scores for each try, and below it what it changed from the first."""
+    if not tries:
+        return ""
+    kinds = {kind.name: kind for kind in KINDS}
+    best = max(
+        (each for each in tries if each.scores.pixel_stride == 1),
+        key=lambda each: each.scores.log_likelihood,
+        default=None,
+    )
+    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in _TABLE_HEADS)
+    rows = [f'<tr style="opacity:0.65"><th></th>{head}</tr>']
+    for each in list(tries)[: -MOST_ROWS - 1 : -1]:
+        marks = "▸" if each.number == shown else ""
+        marks += " A" if each.number == pinned else ""
+        marks += "★" if each is best else ""
+        about = "~" if each.scores.pixel_stride > 1 else ""
+        numbers = "".join(
+            f'<td style="text-align:right;white-space:nowrap">{about}{kinds[name].text(each.scores)}</td>'
+            for name in _TABLE_COLUMNS
+        )
+        shade = "background:rgba(0,114,178,0.12);" if each.number == shown else ""
+        rows.append(
+            f'<tr style="{shade}"><td style="white-space:nowrap"><b>{each.number}</b> {marks}'
+            f"{_TABLE_MARKS[each.by]}</td>{numbers}</tr>"
+            f'<tr style="{shade}"><td></td>'
+            f'<td colspan="{len(_TABLE_COLUMNS)}" style="opacity:0.7;padding-bottom:3px">'
+            f"{in_html(changes(tries[0].config, each.config))}</td></tr>"
+        )
+    key = "▸ shown · A reference · ★ highest likelihood · ◆ from the search · ~ some of the pixels"
+    return (
+        '<div style="max-height:22em;overflow:auto;margin:0 0.5em">'
+        f'<table style="font-size:0.75em;border-spacing:0.4em 0;width:100%">{"".join(rows)}</table></div>'
+        f'<div style="font-size:0.7em;opacity:0.65;margin:0.2em 0.9em">{key}</div>'
+    )
+
+
+def changes(first: Config, config: Config) -> str:
+    """Changes of a configuration from the first, as text."""
+    names = differences(first, config)
+    if not names:
+        return "first parameters"
+    return ", ".join(f"{name.split('.')[-1].replace('_', ' ')} {_short(config, name)}" for name in names)
+
+
+def _short(config: Config, name: str) -> str:
+    value: object = dataclasses.asdict(config)
+    for field in name.split("."):
+        assert isinstance(value, dict)
+        value = value[field]
+    if isinstance(value, tuple):
+        return "(" + ", ".join(f"{term:.4g}" for term in value) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
