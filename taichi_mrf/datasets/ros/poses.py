@@ -316,6 +316,11 @@ def body_of(
         if body == optical:
             own = optical or "camera"
             if optical not in tree.frames and not any(word in topic.lower() for word in CAMERAS):
+                if not optical and tree.frames:
+                    raise DatasetError(
+                        "neither it nor the messages name a frame: ?optical=FRAME&body=FRAME says which of "
+                        f"tf's frames ({', '.join(tree.frames)}) are the sensor's and that of the poses"
+                    )
                 options = f"?body={own}" if optical else f"?optical={own}&body={own}"
                 raise DatasetError(
                     f"it names no body that its poses are of, and no transform to {optical or 'the sensor'} "
