@@ -78,7 +78,8 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     search = Search(sample, given, steps)
     best = search.best()
     before = search.score(given)
-    if len(sample.pairs) >= FEWEST_PAIRS and _same_poses(sample) and before > _CONTRADICTING:
+    off = search.differences(given)
+    if len(off) >= FEWEST_PAIRS and _same_poses(sample) and off.mean() > _CONTRADICTING:
         text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     if best == given and before > _CONTRADICTING:
