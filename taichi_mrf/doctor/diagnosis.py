@@ -9,7 +9,7 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
-from taichi_mrf.doctor.readings import UNITS, Reading
+from taichi_mrf.doctor.readings import POSE_UNITS, UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
@@ -78,6 +78,10 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     search = Search(sample, given, steps)
     best = search.best()
     before = search.score(given)
+    off = search.differences(given)
+    if len(off) >= FEWEST_PAIRS and _same_poses(sample) and off.mean() > _CONTRADICTING:
+        text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
+        return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     if best == given and before > _CONTRADICTING:
         return Diagnosis((), (_NO_READING,), given)
     undecided = tuple(search.undecided(best))
@@ -130,14 +134,23 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
     if best.factor != given.factor:
         right = steps / best.factor
-        unit = next(name for each, name in UNITS.items() if math.isclose(each, right))
-        text = f"depth has {right:.6g} steps per metre ({unit}), not {steps:.6g}"
-        found.append(Finding(text, f"--depth-scale {right:.6g}"))
+        unit = next((name for each, name in UNITS.items() if math.isclose(each, right, rel_tol=1e-6)), "")
+        if best.factor in POSE_UNITS and unit in ("", UNITS[1.0]):  # no sensor counts whole metres
+            of_poses = POSE_UNITS[best.factor]
+            found.append(Finding(f"poses are in {of_poses}: divide their positions by {best.factor:g}"))
+        else:
+            text = f"depth has {right:.6g} steps per metre ({unit}), not {steps:.6g}"
+            found.append(Finding(text, f"--depth-scale {right:.6g}"))
     if best.lens and isinstance(source.camera, PinholeCamera):
         k = best.camera_of(source.camera)
         flag = f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
         found.append(Finding(f"the intrinsics {best.lens}", flag))
     return found
+
+
+def _same_poses(sample: Sample) -> bool:
+    """Whether the poses say that the sensor does not move."""
+    return len(sample.poses) > 0 and np.allclose(sample.poses, sample.poses[0], rtol=0, atol=1e-6)
 
 
 def _steps(sample: Sample) -> float:

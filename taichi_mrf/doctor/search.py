@@ -12,7 +12,7 @@ from taichi_mrf.datasets.conventions import AXES
 from taichi_mrf.datasets.depth_scale import SeenAgain, seen_again
 from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.timed_poses import TimedPoses
-from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
+from taichi_mrf.doctor.readings import LENSES, POSE_UNITS, UNITS, Reading
 from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -58,10 +58,11 @@ class Search:
     def __init__(self, sample: Sample, given: Reading, steps_per_metre: float) -> None:
         """``steps_per_metre`` is the unit of the depth images as they are read."""
         self.sample, self.given = sample, given
-        self._units = [steps_per_metre / steps for steps in UNITS if not np.isclose(steps, steps_per_metre)]
+        factors = np.array([*(steps_per_metre / steps for steps in UNITS), *POSE_UNITS])
+        self._units = [float(each) for each in np.unique(factors.round(12)) if not np.isclose(each, 1.0)]
         self._known: dict[Reading, Floats] = {}
         self._mended: dict[Reading, Floats] = {}
-        self._least = np.full(len(sample.pairs), _WORST)
+        self._usable = 0, np.zeros(len(sample.pairs), dtype=bool)
         self._place = {int(frame): place for place, frame in enumerate(sample.frames)}
         cameras = [view.camera for view in sample.views.values() if isinstance(view.camera, PinholeCamera)]
         of_lenses = {LENSES[lens](camera): lens for camera in cameras[:1] for lens in reversed(LENSES)}
@@ -73,8 +74,7 @@ class Search:
     def differences(self, reading: Reading) -> Floats:
         """By how much the frames of each pair differ, 0 to 0.2; NaN where a pose is not known at the time."""
         if reading not in self._known:
-            found = np.fromiter(self._differences(reading), np.float64)
-            self._known[reading], self._least = found, np.fmin(self._least, found)
+            self._known[reading] = np.fromiter(self._differences(reading), np.float64)
         return self._known[reading]
 
     def moves(self, reading: Reading) -> Iterator[Pose | None]:
@@ -102,8 +102,14 @@ class Search:
                 yield min(there, _difference(points[second], inverse(T), views[first], reading))
 
     def usable(self) -> NDArray[np.bool_]:
-        """The pairs that something that was tried explains: the others see different things."""
-        return self._least <= EXPLAINED
+        """The pairs that something that was tried explains: the others see different things. Of so many
+        readings one explains a pair by chance, so only those that explain many count."""
+        if self._usable[0] < len(self._known):
+            explained = np.array([*self._known.values()]) <= EXPLAINED
+            pairs = explained.sum(axis=1)
+            telling = explained[pairs >= max(FEWEST_PAIRS, pairs.max() / 2)]
+            self._usable = len(self._known), telling.any(axis=0)
+        return self._usable[1]
 
     def score(self, reading: Reading) -> float:
         """The mean difference over the usable pairs. If too few of them tell, one more than over all."""

@@ -77,11 +77,12 @@ class Sample:
 
 def read_sample(dataset: Dataset, seconds: float = math.inf) -> Sample:
     """Read some frames; broken ones are passed over, and those that are left after so many seconds. Raises
-    DatasetError if the source cannot be read."""
+    DatasetError if the source cannot be read, or if all of them are broken."""
     begin = time.monotonic()
     count = len(dataset)
     views: dict[int, View] = {}
     poses: dict[int, tuple[float, Pose]] = {}
+    broken: FrameError | None = None
 
     firsts = dict.fromkeys(np.linspace(0, count - 1, PLACES + 1).round().astype(int)[:-1].tolist())
     pairs = [(i, i + apart) for apart in APART for i in firsts if i + apart < count]
@@ -90,12 +91,15 @@ def read_sample(dataset: Dataset, seconds: float = math.inf) -> Sample:
             break
         try:
             frame = dataset.read(index)
-        except FrameError:
+        except FrameError as error:
+            broken = broken or error
             continue
         poses[index] = (frame.stamp, frame.T_world_camera)
         view = view_of(frame)
         if view is not None:
             views[index] = view
+    if broken is not None and not poses:
+        raise broken
     stamps = dataset.stamps()
     for index in _neighbours(pairs, poses) if seconds == math.inf else ():
         if 0 <= index < count and index not in poses:
@@ -104,6 +108,8 @@ def read_sample(dataset: Dataset, seconds: float = math.inf) -> Sample:
     frames = np.array(sorted(poses), dtype=np.int64)
     T = np.array([poses[i][1] for i in frames]).reshape(-1, 4, 4)
     T[:, :3, 3] += dataset.origin_m  # a pose is written in another way before its origin is moved
+    if count <= 2 * APART[-1]:  # so few frames that hardly any two see the same: all that are read count
+        pairs = [(i, i + apart) for apart in APART for i in views]
     pairs = [(i, j) for i, j in pairs if i in views and j in views]
     return Sample(views, pairs, frames, np.array([poses[i][0] for i in frames]), T)
 

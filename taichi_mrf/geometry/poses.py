@@ -34,7 +34,9 @@ def as_pose(T: ArrayLike) -> Pose:
     if not np.isfinite(matrix).all():
         raise KeyframeError("a pose holds a value that is not finite (NaN or infinity)")
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise KeyframeError("the last row of a pose is not 0 0 0 1")
+        transposed = np.abs(matrix[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() <= 1e-6
+        hint = ", but its last column is: write it transposed" if transposed else ""
+        raise KeyframeError(f"the last row of a pose is not 0 0 0 1{hint}")
     matrix[:3, :3] = nearest_rotation(matrix[:3, :3])
     return matrix
 

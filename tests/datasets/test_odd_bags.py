@@ -73,7 +73,14 @@ def by_both(bag: Bag) -> None:
     moving_tf(bag, "odom", np.eye(4))
 
 
-@pytest.mark.parametrize("poses", [moving_tf, by_odometry, by_both])
+def localised(bag: Bag) -> None:
+    """The frame of the clouds moves itself in that of a localiser."""
+    moving_tf(bag)
+    for i in range(COUNT):
+        bag.tf("/tf", stamp(i), "earth", "map", world_body(i))
+
+
+@pytest.mark.parametrize("poses", [moving_tf, by_odometry, by_both, localised])
 def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
     tmp_path: Path, poses: Callable[[Bag], None]
 ) -> None:

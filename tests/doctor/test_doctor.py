@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from broken_recordings import BREAKS, FLAGS, LATE_S, of_frames
+from broken_recordings import BREAKS, FLAGS, LATE_S, of_frames, of_poses
 from console import carry_out
 from datasets_recordings import stamped_line, write_image
 from kitti_street import write_kitti
@@ -127,6 +127,29 @@ def test_a_camera_that_turns_in_place_does_not_tell_the_unit(room: list[Frame]) 
     still = diagnose(of_frames([replace(room[0], stamp=i / 10) for i in range(30)]))
     assert still.findings == ()
     assert {"the unit of depth", "the direction of poses", "the time of poses"} <= set(still.undecided)
+
+
+def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
+    same = [replace(frame, T_world_camera=room[0].T_world_camera) for frame in room]
+    (finding,) = diagnose(of_frames(same)).findings
+    assert "all the same" in finding.text
+    assert "--poses FILE" in finding.text
+    in_mm = of_poses(lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [np.eye(4)[3:]]]))(room)
+    (finding,) = diagnose(of_frames(in_mm)).findings
+    assert finding.text == "poses are in millimetres: divide their positions by 1000"
+
+
+def test_a_short_recording_of_quick_turns_is_understood(room: list[Frame]) -> None:
+    camera, frames = replace(room[0].camera, width=80, height=60, fx=62, fy=62, cx=39.5, cy=29.5), []
+    scene = open_dataset("synthetic:room?frames=40", color=False).scene  # type: ignore[attr-defined]
+    for angle in np.arange(24) * np.pi / 12:
+        eye = np.array([0.4 * np.cos(angle), 0.5 * np.sin(angle), 0.0])
+        ahead = (np.cos(2 * angle), np.sin(2 * angle), 0.3 * np.sin(3 * angle))
+        T = look_at(tuple(eye), tuple(eye + ahead))
+        frames.append(Frame(render(scene, camera, T, False)[0], T, camera, angle, f"{angle}"))
+    assert diagnose(of_frames(frames)).findings == ()
+    (finding,) = diagnose(of_frames(broken(frames, "opengl"))).findings
+    assert finding.flag == "--poses-are opengl"
 
 
 def test_frames_that_see_different_things_tell_nothing(room: list[Frame]) -> None:

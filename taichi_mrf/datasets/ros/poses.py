@@ -24,7 +24,7 @@ from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.tf import alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, path_topics, pose_topics
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.ros.transform_tree import WORLDS, TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -120,7 +120,9 @@ def find_poses(
     optical = choice.optical or frame
     candidates = pose_candidates(reader, tree, optical)
     below = tree.moving_below(optical) if optical and not choice.optical else []
-    if not candidates and below and choice.pose in ("", FROM_TF):
+    # What a world of an odometry holds has been moved there, though this world moves in that of a localiser.
+    moved = optical in WORLDS and (candidates == [FROM_TF] or choice.pose == FROM_TF)
+    if below and (not candidates or moved) and choice.pose in ("", FROM_TF):
         return _of_body(reader, tree, optical, below, choice)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
@@ -314,6 +316,11 @@ def body_of(
         if body == optical:
             own = optical or "camera"
             if optical not in tree.frames and not any(word in topic.lower() for word in CAMERAS):
+                if not optical and tree.frames:
+                    raise DatasetError(
+                        "neither it nor the messages name a frame: ?optical=FRAME&body=FRAME says which of "
+                        f"tf's frames ({', '.join(tree.frames)}) are the sensor's and that of the poses"
+                    )
                 options = f"?body={own}" if optical else f"?optical={own}&body={own}"
                 raise DatasetError(
                     f"it names no body that its poses are of, and no transform to {optical or 'the sensor'} "
