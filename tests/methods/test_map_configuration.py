@@ -31,6 +31,7 @@ OTHER = {
     "inference.prior": 0.2,
     "volume.lower": (-1.0, -2.0, -3.0),
     "volume.upper": (4.0, 5.0, 6.0),
+    "volume.origin": (1000.0, 2000.0, 0.0),
     "visibility.visible_if_clear": 0.9,
 }
 """Values for the fields to which ``another`` has no answer."""
