@@ -1,4 +1,4 @@
-"""What every source of frames offers, and how a source is registered."""
+"""Interface of a source of frames, and its entry in the registry."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -49,13 +49,13 @@ class Format:
     """The files that make a folder or a file one of this format, as error messages list them."""
 
     recognises: Callable[[Path], bool]
-    """Whether a folder or a file is of this format, even if some of its files are missing or damaged."""
+    """True if a folder or a file is of this format, even if some of its files are missing or damaged."""
 
     open: Callable[..., "Dataset"]
     """``(path, options)``, a ReadOptions, lists the frames. Raises DatasetError, which names the file."""
 
     takes_query: bool = False
-    """Whether ``open`` is ``(path, query, options)``: with the text after a question mark in the name."""
+    """True if ``open`` is ``(path, query, options)``: with the text after a question mark in the name."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class BuiltIn:
     name: str
     open: Callable[[str, ReadOptions], "Dataset"]
     rendered: bool = False
-    """Whether Taichi renders its frames, so that it must have been started before they are read."""
+    """True if Taichi renders its frames, so that it must have been started before they are read."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,10 @@ class StatedSensor:
     """Standard deviation of depth: coefficients in ascending powers of depth in metres."""
 
     pixel_sigma: bool = False
-    """Whether frames state a sigma for each pixel."""
+    """True if frames state a sigma for each pixel."""
 
     origin: str = "the recording's own"
-    """Where the sigma and the like come from, in the words of a note."""
+    """Origin of the sigma and the like, in the words of a note."""
 
     reach_m: float | None = None
     """How far it measures; None if only its depths tell."""
@@ -109,18 +109,18 @@ class Dataset(ABC):
 
     @property
     def endless(self) -> bool:
-        """Whether the source never ends, as a camera: then len has no meaning, frames cannot be read twice,
+        """True if the source never ends, as a camera: then len has no meaning, frames cannot be read twice,
         and an error other than FrameError ends the sequence."""
         return False
 
     @property
     def stated(self) -> StatedSensor:
-        """What is known of its sensor."""
+        """Facts that the recording states of its sensor."""
         return StatedSensor()
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
-        """Where its frames' origin is in the recorded world, (3,) metres: add it to their coordinates."""
+        """Origin of its frames in the recorded world, (3,) metres: add it to their coordinates."""
         return np.zeros(3)
 
     def check_scale(self, poses_are_used: bool) -> list[str]:
@@ -188,7 +188,7 @@ class Table(Dataset, Generic[AnyRow]):
 
     rows: Sequence[AnyRow] = field(kw_only=True)
     confidence: Confidence | None = field(default=None, kw_only=True)
-    """What the images of confidence mean that come with the frames, None without."""
+    """Meaning of the images of confidence that come with the frames, None without."""
 
     @property
     def stated(self) -> StatedSensor:

@@ -63,7 +63,7 @@ class ColorCamera:
 
 
 def without_black(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The same colours (..., 3) with 1 1 1 for black: 0 0 0 stands for no colour."""
+    """Colours (..., 3) with 1 1 1 for black: 0 0 0 stands for no colour."""
     colors[(colors[..., 0] | colors[..., 1] | colors[..., 2]) == 0] = 1
     return colors
 

@@ -48,7 +48,7 @@ class Conventions:
 
     @property
     def of_poses(self) -> bool:
-        """Whether any of them is of poses."""
+        """True if any of them is of poses."""
         return self != Conventions(along_ray=self.along_ray)
 
     def flags(self) -> list[str]:

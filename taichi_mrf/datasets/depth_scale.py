@@ -1,4 +1,4 @@
-"""Whether the steps per metre of a recording's depth images agree with its poses.
+"""Check that the steps per metre of a recording's depth images agree with its poses.
 
 A 16-bit image does not contain its unit. Between two poses some centimetres apart a surface moves in the
 image by focal length * baseline / depth: only with the right scale do the depths of neighbouring frames

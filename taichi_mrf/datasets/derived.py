@@ -21,7 +21,7 @@ class Derived(Dataset):
 
     @property
     def endless(self) -> bool:
-        """Whether the source is."""
+        """True if the source is."""
         return self.source.endless
 
     @property

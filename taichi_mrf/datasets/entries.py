@@ -28,7 +28,7 @@ NUMBERED_FILES = "NNNN.png (here or in depth/) and a trajectory (.log, .json, .f
 
 CLOUDS = (".npz", ".ply", ".pcd", ".bin", ".las", ".laz")
 CLOUD_PLACES = ("", "scans", "clouds", "lidar", "velodyne", "pcd", "ply", "las")
-"""Where clouds are in a folder."""
+"""Places of clouds in a folder."""
 
 YAML = (".yaml", ".yml")
 
@@ -65,7 +65,7 @@ def velodyne_sequence(path: Path) -> Path | None:
 
 
 def holds_frames(path: Path) -> bool:
-    """Whether an npz file, or the first of a folder, holds frames, and not a map or something else."""
+    """True if an npz file, or the first of a folder, holds frames, and not a map or something else."""
     if is_folder(path):
         path = next(iter(sorted(path.glob("*.npz"))), path)
     if path.suffix != ".npz" or not is_file(path):
@@ -78,14 +78,14 @@ def holds_frames(path: Path) -> bool:
 
 
 def _has(*names: str) -> Callable[[Path], bool]:
-    """Whether a folder has these files, and, by names that end in a slash, these folders."""
+    """True if a folder has these files, and, by names that end in a slash, these folders."""
     return lambda folder: all(
         is_folder(folder / name) if name.endswith("/") else is_file(folder / name) for name in names
     )
 
 
 def _has_named(pattern: str, below: str = "") -> Callable[[Path], bool]:
-    """Whether a folder, or one ``below`` it, has something whose whole name fits a pattern."""
+    """True if a folder, or one ``below`` it, has something whose whole name fits a pattern."""
     name = re.compile(pattern)
     return lambda folder: (
         is_folder(folder / below) and any(name.fullmatch(path.name) for path in (folder / below).iterdir())

@@ -106,7 +106,7 @@ def hint_for(path: Path) -> str | None:
 
 
 def image_hint(images: Sequence[Path], what: str) -> str:
-    """What is missing for images, of which some are looked at, to be a recording."""
+    """Hint on what is missing for images, of which some are looked at, to be a recording."""
     depth = next((path for path in images if holds_depth(path)), None)
     if depth is None:
         return (

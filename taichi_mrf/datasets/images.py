@@ -45,7 +45,7 @@ def read_depth(
 
 
 def holds_depth(path: Path) -> bool:
-    """Whether a file is an image that may be one of depth: grey of 16 bits or of floats."""
+    """True if a file is an image that may be one of depth: grey of 16 bits or of floats."""
     try:
         steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED)
     except DatasetError:
@@ -54,7 +54,7 @@ def holds_depth(path: Path) -> bool:
 
 
 def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
-    """Whether a depth image has floats, and the share of its pixels that have the largest whole number;
+    """Pair of whether a depth image has floats and the share of its pixels that have the largest whole number;
     (False, 0) for one that cannot be read."""
     try:
         steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)

@@ -25,7 +25,7 @@ def read_intrinsics(path: Path) -> PinholeCamera:
 
 
 def is_trajectory_json(path: Path) -> bool:
-    """Whether a file is JSON of one of the two kinds of trajectory."""
+    """True if a file is JSON of one of the two kinds of trajectory."""
     try:
         return _values(path).get("class_name") in _LISTS
     except (DatasetError, AttributeError):

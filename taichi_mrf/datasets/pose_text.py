@@ -125,7 +125,7 @@ def _named(head: str) -> Columns | None:
 
 
 def _field(name: str) -> str | None:
-    """What a column's name stands for: stamp, x, y, z, qx, qy, qz or qw."""
+    """Meaning of a column's name: stamp, x, y, z, qx, qy, qz or qw."""
     if _STAMP.fullmatch(name):
         return "stamp"
     axis, head = name[-1:], name[:-1].rstrip("._")

@@ -12,7 +12,7 @@ from taichi_mrf.system.files import is_file, is_folder
 
 
 def _lists_sensors(path: Path) -> bool:
-    """Whether a YAML file has an entry ``sensors``."""
+    """True if a YAML file has an entry ``sensors``."""
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         return False
     try:
@@ -28,7 +28,7 @@ def _is_stray_scanner(path: Path) -> bool:
 
 
 def _is_record3d(path: Path) -> bool:
-    """Whether a file ends in .r3d, or a folder holds what is in one."""
+    """True if a file ends in .r3d, or a folder holds what is in one."""
     if is_file(path):
         return path.suffix.lower() == ".r3d"
     return is_file(path / "metadata") and is_folder(path / "rgbd")

@@ -21,7 +21,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
 ASKED = "--depth-scale"
-"""Where a scale comes from that the caller gives."""
+"""Origin of a scale that the caller gives."""
 
 _LOOKED_AT = 4
 """Images of which the kind and the share of the largest value are found when a recording is opened."""
@@ -154,7 +154,7 @@ def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDA
 
 
 def _evidence(found: Evidence, steps_per_metre: float) -> str:
-    """What supports a scale, in words."""
+    """Evidence for a scale, in words."""
     words = []
     if found.median is not None:
         words.append(f"the median depth is {found.median / steps_per_metre:.2f} m")

@@ -77,7 +77,7 @@ def format_name(source: str | Path) -> str:
 
 
 def absolute_source(source: str) -> str:
-    """The same source for a process that works in another folder."""
+    """Name of a source for a process that works in another folder."""
     path, query = _path_and_query(source)
     if not exists(path):
         return source
@@ -85,7 +85,7 @@ def absolute_source(source: str) -> str:
 
 
 def is_rendered(source: str) -> bool:
-    """Whether Taichi must run before the source's frames can be read."""
+    """True if Taichi must run before the source's frames can be read."""
     built_in = BUILT_IN.get(source.partition("?")[0])
     return built_in is not None and built_in.rendered
 

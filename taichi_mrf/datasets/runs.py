@@ -21,7 +21,7 @@ def starts_of_runs(stamps: Sequence[float] | NDArray[np.float64]) -> list[int]:
 
 
 def _is_off(stamps: NDArray[np.float64], i: int) -> bool:
-    """Whether the stamp after this one follows the one before it."""
+    """True if the stamp after this one follows the one before it."""
     return bool(0 < i < len(stamps) - 1 and stamps[i + 1] > stamps[i - 1])
 
 

@@ -36,10 +36,10 @@ class SourceFlags:
     (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), late=SECONDS."""
 
     mounting: str | None = None
-    """Where the camera is in the frame that the poses are of: x,y,z,qx,qy,qz,qw in metres."""
+    """Place of the camera in the frame that the poses are of: x,y,z,qx,qy,qz,qw in metres."""
 
     depth_is: Literal["axial", "range"] = "axial"
-    """Whether depth is along the optical axis, or the distance along each pixel's ray."""
+    """Depth along the optical axis, or distance along each pixel's ray."""
 
     def words(self) -> list[str]:
         """The flags that differ from the defaults, as they are typed."""
@@ -51,7 +51,7 @@ class SourceFlags:
         self.keywords()
 
     def keywords(self) -> dict[str, Any]:
-        """The same as arguments of ``open_dataset``. Raises ConfigError, which names the flag."""
+        """Keyword arguments of ``open_dataset``. Raises ConfigError, which names the flag."""
         keywords: dict[str, Any] = {
             "depth_scale": self.depth_scale,
             "intrinsics": _numbers("--camera", self.camera, (4,), "fx,fy,cx,cy"),

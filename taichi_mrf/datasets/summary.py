@@ -48,7 +48,7 @@ class Summary:
     centre_range: tuple[tuple[float, ...], tuple[float, ...]] | None
     problem: str | None
     usable: bool
-    """Whether any of the frames could be read; otherwise there is nothing to map."""
+    """True if any of the frames could be read; otherwise there is nothing to map."""
 
 
 def summarise(dataset: Dataset) -> Summary:

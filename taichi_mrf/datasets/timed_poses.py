@@ -94,7 +94,7 @@ class TimedPoses:
 
     @property
     def stands_still(self) -> bool:
-        """Whether several poses are all the same."""
+        """True if several poses are all the same."""
         return len(self) > 1 and np.allclose(self.poses, self.poses[0], rtol=0, atol=_SAME)
 
     def at(self, stamp: float, largest_gap: float) -> Pose | None:

@@ -50,7 +50,7 @@ class RecordedPose:
 
     @property
     def is_lost(self) -> bool:
-        """Whether its numbers say that tracking was lost: NaN, infinity, or a quaternion of zeros."""
+        """True if its numbers say that tracking was lost: NaN, infinity, or a quaternion of zeros."""
         return not (np.isfinite(self.values).all() and self.values.reshape(-1)[3:].any())
 
     def T_world_camera(self) -> Pose:
@@ -143,7 +143,7 @@ def valid_poses(trajectory: Trajectory) -> tuple[list[float], list[Pose]]:
 
 
 def is_trajectory(path: Path) -> bool:
-    """Whether the first lines of a text file look like one of the layouts."""
+    """True if the first lines of a text file look like one of the layouts."""
     try:
         with open_regular(path, DatasetError) as file:
             # Of a file without line ends, no more than this is read either.
@@ -159,7 +159,7 @@ def is_trajectory(path: Path) -> bool:
 
 
 def is_lost(pose_file: Path) -> bool:
-    """Whether the numbers of a pose's own file say that tracking was lost (-inf, nan, -1.#IND)."""
+    """True if the numbers of a pose's own file say that tracking was lost (-inf, nan, -1.#IND)."""
     try:
         return re.search(r"inf|nan|#ind", read_text(pose_file, DatasetError), re.IGNORECASE) is not None
     except DatasetError:

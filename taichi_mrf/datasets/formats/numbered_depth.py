@@ -117,7 +117,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
 
 
 def _unread(folder: Path) -> str:
-    """What is wrong with a text file whose name says that it holds poses, in words."""
+    """Problem of a text file whose name says that it holds poses, in words."""
     if is_file(folder / "transforms.json"):
         return (
             ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "

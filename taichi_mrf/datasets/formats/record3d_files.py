@@ -31,7 +31,7 @@ class Files(Protocol):
     names: frozenset[str]
 
     def where(self, name: str) -> str:
-        """What errors call a file."""
+        """Name of a file in errors."""
 
     def read(self, name: str, most_bytes: int) -> bytes:
         """A file's content. Raises DatasetError, which names the file, if it is missing, damaged or larger
@@ -103,7 +103,7 @@ def open_files(path: Path) -> Files:
 
 
 def is_packed(data: bytes) -> bool:
-    """Whether the content of a file of depth or confidence is an LZFSE stream."""
+    """True if the content of a file of depth or confidence is an LZFSE stream."""
     return data.startswith(_LZFSE)
 
 

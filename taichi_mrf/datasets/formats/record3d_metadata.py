@@ -43,7 +43,7 @@ class Metadata:
 
     @property
     def has_poses(self) -> bool:
-        """Whether any frame has a pose other than the origin, which all have without tracking."""
+        """True if any frame has a pose other than the origin, which all have without tracking."""
         return len(self.poses) == 1 or not bool(np.all(self.poses == _NO_POSE))
 
     def cameras(self, numbers: Sequence[int]) -> list[PinholeCamera] | None:

@@ -31,10 +31,10 @@ HALF_CORRIDOR = 1.0
 """The corridor's walls stand this far from its middle, the line y = 0."""
 
 NORTH_DOORS, SOUTH_DOORS = (-4.6, 0.0, 4.7), (-3.3, 3.7)
-"""Where the doors' middles lie along the corridor."""
+"""Middles of the doors along the corridor."""
 
 NORTH_PARTITIONS, SOUTH_PARTITIONS = (-2.3, 2.4), (0.5,)
-"""Where the middles of the walls between rooms lie."""
+"""Middles of the walls between rooms."""
 
 _PIXEL = 0.02
 

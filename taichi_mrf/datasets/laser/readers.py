@@ -48,7 +48,7 @@ def open_scans(
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether a file, or a folder with ``scans.npz``, contains 2D laser scans, damaged or not."""
+    """True if a file, or a folder with ``scans.npz``, contains 2D laser scans, damaged or not."""
     if is_folder(path):
         path = path / scan_npz.FILE_NAME
     if not is_file(path):

@@ -18,13 +18,13 @@ _ZIP_MAGIC = b"PK"
 
 
 def recognises(path: Path) -> bool:
-    """Whether a file is of this format, damaged or not."""
+    """True if a file is of this format, damaged or not."""
     with open_regular(path, DatasetError) as file:
         return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
 
 
 def holds_ranges(path: Path) -> bool:
-    """Whether an npz file has an array of ranges."""
+    """True if an npz file has an array of ranges."""
     try:
         with open_npz(path, DatasetError, "an npz file that can be read") as file:
             return "range_m" in file

@@ -74,7 +74,7 @@ class LaserScans:
     """(N, B): False for beams without a return."""
 
     no_return_is_free: bool = True
-    """Whether a beam without a return is evidence that the space up to its range is free. In logs of real
+    """True if a beam without a return is evidence that the space up to its range is free. In logs of real
     scanners most such beams met glass or something dark, and carry no evidence."""
 
     floor_plan: FloorPlan | None = None

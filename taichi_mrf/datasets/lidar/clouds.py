@@ -39,7 +39,7 @@ def read_cloud(path: Path) -> NDArray[np.float64]:
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a file may hold a scan, by its ending and its first bytes; a damaged one may."""
+    """True if a file may hold a scan, by its ending and its first bytes; a damaged one may."""
     suffix = path.suffix.lower()
     if suffix not in READERS:
         return False
@@ -106,7 +106,7 @@ READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".las": read_las,
     ".laz": read_las,
 }
-"""What reads a file, by its ending."""
+"""Reader of a file, by its ending."""
 
 
 def natural(path: Path) -> tuple[list[tuple[int, str]], str]:

@@ -110,7 +110,7 @@ def _starts(
     T_world_lidar: Pose,
     gap: float,
 ) -> NDArray[np.float64]:
-    """Where the lidar was when it measured each point of a scan, (n, 3) in its frame at the scan's pose; that
+    """Place of the lidar when it measured each point of a scan, (n, 3) in its frame at the scan's pose; that
     pose itself where it was not known, and for all if it moved less than its noise."""
     poses, known = trajectory.between(times[members], 2 * gap)  # a pose within the gap on both sides
     if not known.any():

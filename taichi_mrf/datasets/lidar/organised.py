@@ -113,7 +113,7 @@ def _circular_median(angles: NDArray[np.float64]) -> float:
 
 
 def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same angles between -pi and pi."""
+    """Angles taken to between -pi and pi."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
 
 

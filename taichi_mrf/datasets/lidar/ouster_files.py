@@ -1,4 +1,4 @@
-"""Whether a recording of Ouster is whole: ouster-sdk trusts what is in it, and wrong sizes end the process.
+"""Check that an Ouster recording is whole: ouster-sdk trusts what is in it, and wrong sizes end the process.
 
 An OSF is a row of blocks: a header, chunks of messages, and metadata. Each is its size in 4 bytes, a
 FlatBuffer of that size whose name stands behind its first 4 bytes, and the CRC-32 of both. A PCAP is a row of

@@ -87,7 +87,7 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class PcdHeader:
-    """What a header says. ``dtype`` is one point's, with a field for each name; ``start`` the byte at which
+    """Content of a header. ``dtype`` is one point's, with a field for each name; ``start`` the byte at which
     the points begin; ``encoding`` ascii, binary or binary_compressed."""
 
     dtype: np.dtype

@@ -21,7 +21,7 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a header says. ``dtype`` is one vertex; ``faces`` how many faces follow, if any; ``start`` the
+    """Content of a header. ``dtype`` is one vertex; ``faces`` how many faces follow, if any; ``start`` the
     byte at which the vertices begin; ``encoding`` ascii, binary_little_endian or binary_big_endian."""
 
     dtype: np.dtype

@@ -1,4 +1,4 @@
-"""Whether the points of scans are in the world's frame or in the sensor's.
+"""Decision whether the points of scans are in the world's frame or in the sensor's.
 
 Files do not tell. Registered clouds of neighbouring scans overlap as they are, those of a sensor at its
 poses; and a scan lies around the place of its sensor, which sees all of its points and none behind another.
@@ -50,7 +50,7 @@ Points = NDArray[np.float64]
 def in_world(
     count: int, read_pose: Callable[[int], Pose], read_points: Callable[[int], Points]
 ) -> bool | None:
-    """Whether points are in the world's frame (True) or in the sensor's (False), None if nothing tells.
+    """True if points are in the world's frame, False if in the sensor's, None if nothing tells.
 
     Looks at a few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in
     their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Warns if poses are

@@ -49,7 +49,7 @@ class FolderOptions:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a PCD, or a folder that holds some, clouds with poses beside them, or several without."""
+    """True if it is a PCD, or a folder that holds some, clouds with poses beside them, or several without."""
     clouds = clouds_of(path)
     if not clouds or not is_cloud(clouds[0]):
         return False
@@ -155,7 +155,7 @@ def _viewpoint(cloud: Path) -> Pose:
 
 
 def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool) -> tuple[bool, list[str]]:
-    """Whether points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
+    """True if points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
     better, and a note where it is not as documented."""
     found = in_world(len(clouds), lambda i: poses[clouds[i]].read(), lambda i: read_cloud(clouds[i]))
     if found is None or found == viewpoints:

@@ -1,1 +1,1 @@
-"""Where the poses of a recording's frames come from, if not from the recording, and how they change."""
+"""Sources of the poses of a recording's frames other than the recording, whose poses may change."""

@@ -1,4 +1,4 @@
-"""What every source of poses offers, and how a kind of source is registered.
+"""Interface of a source of poses, and the entry of its kind in the registry.
 
 A source gives the poses of some frames as they are known now. It is asked again and again, and answers only
 if something has changed since: a file that was written again, a database that was optimised, a topic of a bag
@@ -25,7 +25,7 @@ class PoseSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call the source: a path, or what a caller named it."""
+        """Name of the source in messages: a path, or what a caller named it."""
         ...
 
     @property
@@ -52,7 +52,7 @@ class PoseKind:
     """What makes a file one of this kind, as error messages list it."""
 
     recognises: Callable[[Path], bool]
-    """Whether a file is of this kind, even if it is damaged."""
+    """True if a file is of this kind, even if it is damaged."""
 
     open: Callable[[Path, str], PoseSource]
     """Open a file with the text after the question mark in its name. Raises DatasetError."""
@@ -68,5 +68,5 @@ class CallbackPoses:
     problem: str | None = None
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
-        """What the function returns."""
+        """Poses that the function returns."""
         return self.function(stamp_s)

@@ -43,7 +43,7 @@ class PoseGraph:
 
 
 def is_pose_graph(path: Path) -> bool:
-    """Whether a file is a pose graph, by the ending of its name or its first line."""
+    """True if a file is a pose graph, by the ending of its name or its first line."""
     if path.suffix in SUFFIXES:
         return True
     try:

@@ -41,7 +41,7 @@ class FramePoses:
         self.source = source
         self.conventions = conventions
         self.origin_m: NDArray[np.float64] | None = None
-        """Where the frames' origin is in the source's world, (3,) metres: near its first pose if that is far
+        """Origin of the frames in the source's world, (3,) metres: near its first pose if that is far
         away. None before there is one."""
         self._gap_s = INTERPOLATION_GAP if largest_gap_s is None else real(largest_gap_s, "largest_gap_s", 0)
         self._names = set(frame_names)

@@ -180,7 +180,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
 
 
 def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
-    """What follows the colon, as a file's name and options; options alone need no question
+    """The text after the colon, as a file's name and options; options alone need no question
     mark."""
     file, mark, query = text.partition("?")
     if not mark and "=" in text and not exists(Path(text)):

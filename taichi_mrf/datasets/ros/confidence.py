@@ -82,7 +82,7 @@ def find_confidence(
 
 
 def _beside(name: str, depth: str) -> bool:
-    """Whether a topic's name is that of depth up to ``confidence`` in the place of ``depth``."""
+    """True if a topic's name is that of depth up to ``confidence`` in the place of ``depth``."""
     parts, of_depth = name.split("/"), depth.split("/")
     if PART not in parts or "depth" not in of_depth:
         return False

@@ -69,7 +69,7 @@ def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) 
 
 
 def _turns(message: Any | None) -> bool:
-    """Whether a message has angular rates: the first covariance is -1 if it has none."""
+    """True if a message has angular rates: the first covariance is -1 if it has none."""
     return message is not None and message.angular_velocity_covariance[0] != -1
 
 

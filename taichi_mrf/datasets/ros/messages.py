@@ -49,7 +49,7 @@ GREY = ("mono8", "8UC1")
 """Encodings of grey images of 8 bits."""
 
 _COLOR_CHANNELS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
-"""Where red, green and blue are in the pixels of an encoding."""
+"""Places of red, green and blue in the pixels of an encoding."""
 
 _COMPRESSED_COLOR = ("jpeg", "jpg", "png", "rgb8;", "bgr8;")
 """Beginnings of the formats of CompressedImages in colour."""
@@ -79,7 +79,7 @@ def check_depth(encoding: str) -> None:
 
 
 def may_be_depth(encoding: str) -> bool:
-    """Whether an image of this encoding can be read as depth."""
+    """True if an image of this encoding can be read as depth."""
     try:
         check_depth(encoding)
     except DatasetError:
@@ -88,7 +88,7 @@ def may_be_depth(encoding: str) -> bool:
 
 
 def is_depth(encoding: str, topic: str) -> bool:
-    """Whether images of this encoding on a topic are depth. mono16 and plain PNG count if the topic's name
+    """True if images of this encoding on a topic are depth. mono16 and plain PNG count if the topic's name
     contains depth, because infrared images are so too."""
     kind = encoding.partition(";")[0].strip()
     if not may_be_depth(encoding):
@@ -164,7 +164,7 @@ def _compressed(message: Any) -> tuple[NDArray, float]:
 
 
 def is_color(encoding: str) -> bool:
-    """Whether an image of this encoding is a colour image."""
+    """True if an image of this encoding is a colour image."""
     compressed = encoding.startswith(_COMPRESSED_COLOR) or "; jpeg compressed" in encoding
     return encoding in _COLOR_CHANNELS or (compressed and "compressedDepth" not in encoding)
 

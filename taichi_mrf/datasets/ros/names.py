@@ -15,7 +15,7 @@ was opened, and its number."""
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like a bag: a file by its name, a folder by its metadata or its split files."""
+    """True if a path looks like a bag: a file by its name, a folder by its metadata or its split files."""
     return path.suffix in SUFFIXES if is_file(path) else is_file(path / METADATA) or bool(parts_of(path))
 
 

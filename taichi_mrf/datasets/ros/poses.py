@@ -94,7 +94,7 @@ def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> lis
 
 
 def _is_apart(topic: str, tree: TransformTree) -> bool:
-    """Whether a topic is another robot's."""
+    """True if a topic is another robot's."""
     return any(topic.startswith(f"{space}/") for space in tree.apart)
 
 
@@ -353,7 +353,7 @@ def body_of(
 
 
 def _is_cameras(frame: str) -> bool:
-    """Whether a frame's name may be that of a camera's optical axes; by REP 105 a link has a body's."""
+    """True if a frame's name may be that of a camera's optical axes; by REP 105 a link has a body's."""
     name = frame.lower()
     is_body = any(word in name for word in ("link", "base", "pose", "body", "imu"))
     return ("cam" in name or "optical" in name) and not is_body

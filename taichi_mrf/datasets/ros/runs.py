@@ -38,7 +38,7 @@ class BagRun:
         return [entries[i] for i in part]
 
     def is_over(self, place: int) -> bool:
-        """Whether the run ended before this place in the order of recording."""
+        """True if the run ended before this place in the order of recording."""
         return self.number < len(self.gaps) and place >= self.gaps[self.number][1]
 
 

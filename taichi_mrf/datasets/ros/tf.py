@@ -45,7 +45,7 @@ class _Sent:
 
 
 Transforms = dict[str, list[_Sent]]
-"""What was sent of each frame, in the order of recording."""
+"""Transforms that were sent of each frame, in the order of recording."""
 
 
 def tree_of(
@@ -88,7 +88,7 @@ def tree_of(
 
 
 def read_transforms(reader: RosReader) -> dict[str, Transforms]:
-    """What was sent in each namespace."""
+    """Transforms that were sent in each namespace."""
     sent: dict[str, Transforms] = {}
     for topic in reader.topics.values():
         if topic.type not in messages.TF:
@@ -136,7 +136,7 @@ def _of_sensor(
 
 
 def _are_twins(space: str, topic: str) -> bool:
-    """Whether two names begin with those of two robots: /robot1 and /robot2."""
+    """True if two names begin with those of two robots: /robot1 and /robot2."""
     a, b = (name.split("/")[1] for name in (f"{space}/", topic if "/" in topic else "/"))
     return a != b and re.sub(r"\d+", "", a) == re.sub(r"\d+", "", b) != ""
 
@@ -206,7 +206,7 @@ def _steps(poses: np.ndarray, apart: int = 1) -> np.ndarray:
 
 
 def alternates(stamps: Sequence[float], poses: Sequence[Pose]) -> bool:
-    """Whether poses with stamps are those of two bodies in turn: again and again a few of them are far from
+    """True if poses with stamps are those of two bodies in turn: again and again a few of them are far from
     those before and after, which are near each other."""
     order = np.argsort(stamps, kind="stable")
     s, T = np.asarray(stamps, np.float64)[order], np.asarray(poses, np.float64).reshape(-1, 4, 4)[order]

@@ -1,4 +1,4 @@
-"""What rosbags refuses and should not, and what it takes and should not.
+"""Corrections of rosbags: files that it refuses and should not, or takes and should not.
 
 It refuses a whole file for one channel of another encoding, or one message definition that it cannot parse.
 Here such topics are set aside, with the reason.

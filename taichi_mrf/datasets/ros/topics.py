@@ -30,7 +30,7 @@ class DepthTopic:
 
     @property
     def rectified(self) -> bool:
-        """Whether its images are those of an ideal camera: REP 104 calls such topics image_rect..."""
+        """True if its images are those of an ideal camera: REP 104 calls such topics image_rect..."""
         return any(part.startswith("image_rect") for part in self.name.split("/"))
 
 

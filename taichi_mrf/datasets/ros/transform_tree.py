@@ -78,11 +78,11 @@ class TransformTree:
         return path
 
     def connects(self, a: str, b: str) -> bool:
-        """Whether two frames are connected."""
+        """True if two frames are connected."""
         return a == b or self.ancestors(a)[-1] == self.ancestors(b)[-1]
 
     def is_world_of(self, frame: str, parent: str, body: str) -> bool:
-        """Whether a frame is fixed where poses of a ``body`` in ``parent`` are: the parent, one above it, or
+        """True if a frame is fixed where poses of a ``body`` in ``parent`` are: the parent, one above it, or
         one that is fixed to it and not to the body."""
         if frame == parent or frame in self.ancestors(parent):
             return True
@@ -95,7 +95,7 @@ class TransformTree:
         return [each for each in bodies if not any(each in self.ancestors(o)[1:] for o in bodies)]
 
     def moves(self, a: str, b: str) -> bool:
-        """Whether a transform on the way from one connected frame to the other changes with time."""
+        """True if a transform on the way from one connected frame to the other changes with time."""
         return any(isinstance(edge, TimedPoses) for edge in self.between(a, b))
 
     def between(self, a: str, b: str) -> list[Edge]:

@@ -23,7 +23,7 @@ from taichi_mrf.system.files import read_text
 
 @dataclass(frozen=True)
 class RecordedPair(Row):
-    """Where one pair's images are."""
+    """Files of one pair's images."""
 
     left_file: Path
     right_file: Path

@@ -103,7 +103,7 @@ def distance_to(solid: Solid, points: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def translated(solids: Iterable[Solid], offset: Point) -> tuple[Solid, ...]:
-    """The same solids, moved."""
+    """Copy of the solids, moved."""
     moved = []
     for s in solids:
         center = (s.center[0] + offset[0], s.center[1] + offset[1], s.center[2] + offset[2])

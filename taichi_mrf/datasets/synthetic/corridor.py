@@ -64,12 +64,12 @@ class Room:
 
     @property
     def turned(self) -> bool:
-        """Whether it lies south of the corridor, by half a turn."""
+        """True if it lies south of the corridor, by half a turn."""
         return self.number % 2 == 1
 
     @property
     def mirrored(self) -> bool:
-        """Whether x changes its sign."""
+        """True if x changes its sign."""
         return self.number // 2 % 2 == 1
 
     def to_plan(self, x: float, y: float) -> tuple[float, float]:

@@ -21,7 +21,7 @@ STANDS_S = 5.0
 
 @dataclass(frozen=True)
 class Place:
-    """Where a thing is: its own origin in the world, and its yaw about the vertical (radians)."""
+    """Place of a thing: its own origin in the world, and its yaw about the vertical (radians)."""
 
     x: float
     y: float
@@ -50,11 +50,11 @@ class Stay:
 
     @property
     def stands(self) -> bool:
-        """Whether the thing stands in one place, and for long enough to count as standing."""
+        """True if the thing stands in one place, and for long enough to count as standing."""
         return self.begin == self.end and self.end_s - self.start_s >= STANDS_S
 
     def place(self, stamp_s: float) -> Place:
-        """Where the thing is at a time of the stay."""
+        """Place of the thing at a time of the stay."""
         return self.begin.towards(self.end, (stamp_s - self.start_s) / (self.end_s - self.start_s))
 
 
@@ -68,7 +68,7 @@ class Thing:
 
     @property
     def walks(self) -> bool:
-        """Whether the thing never stands."""
+        """True if the thing never stands."""
         return not any(stay.stands for stay in self.stays)
 
     def solids_at(self, stamp_s: float) -> tuple[Solid, ...]:
@@ -79,7 +79,7 @@ class Thing:
         return ()
 
     def moved_by(self, offset: Point) -> "Thing":
-        """The same thing with all its places moved."""
+        """Copy of the thing with all its places moved."""
         x, y, z = offset
 
         def moved(place: Place) -> Place:

@@ -233,7 +233,7 @@ class SyntheticRing(RenderedSequence):
 
     @cached_property
     def way(self) -> SmoothWay:
-        """Where the camera goes, in the world frame."""
+        """Way of the camera in the world frame."""
         return ring_way(self.options.length)
 
     def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:

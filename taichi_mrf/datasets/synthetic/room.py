@@ -40,7 +40,7 @@ class SyntheticRoom(RenderedSequence):
 
     @cached_property
     def moving_scene(self) -> MovingScene | None:
-        """What happens in the room, in the world frame; None if nothing moves."""
+        """Events in the room, in the world frame; None if nothing moves."""
         if self.options.moving == "none":
             return None
         return moving_room(self.options.moving, self.options.seed)
