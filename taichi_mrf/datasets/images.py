@@ -54,7 +54,7 @@ def holds_depth(path: Path) -> bool:
 
 
 def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
-    """Pair of whether a depth image has floats and the share of its pixels that have the largest whole number;
+    """True for a depth image of floats, and the share of its pixels that have the largest whole number;
     (False, 0) for one that cannot be read."""
     try:
         steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
