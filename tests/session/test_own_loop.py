@@ -136,6 +136,7 @@ print("ended", flush=True)
 """
 
 
+@pytest.mark.usefixtures("own_interrupts")
 def test_a_script_without_a_guard_has_a_page(tmp_path: Path) -> None:
     """Its main module is not run again by the page's process, and Ctrl-C ends what shows the map."""
     path = tmp_path / "loop.py"
