@@ -71,7 +71,7 @@ class BuiltIn:
 
 @dataclass(frozen=True)
 class StatedSensor:
-    """What a recording, or its kind of sensor, says of the sensor; the defaults say nothing."""
+    """Facts of the sensor that a recording, or its kind, states; the defaults state nothing."""
 
     sigma: tuple[float, ...] | None = None
     """Standard deviation of depth: coefficients in ascending powers of depth in metres."""
@@ -192,7 +192,7 @@ class Table(Dataset, Generic[AnyRow]):
 
     @property
     def stated(self) -> StatedSensor:
-        """What the confidence is relative to."""
+        """Sigma that the confidence is relative to."""
         if self.confidence is None:
             return super().stated
         return StatedSensor(self.confidence.sigma, True, self.confidence.origin)

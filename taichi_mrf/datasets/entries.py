@@ -98,7 +98,7 @@ def _is_velodyne(path: Path) -> bool:
 
 
 def _is_scan_folder(path: Path) -> bool:
-    """What its reader says, which looks into files: it is asked where there are any that may be clouds."""
+    """Answer of its reader, which looks into files: it is asked where there are any that may be clouds."""
     if is_file(path):
         return path.suffix.lower() == ".pcd"
     places = (path / place for place in CLOUD_PLACES)

@@ -129,7 +129,7 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
 
 
 def of_this_size(camera: PinholeCamera) -> PinholeCamera:
-    """The same camera, whose intrinsics came without the size of their images. Raises ConfigError if that is
+    """Camera whose intrinsics came without the size of their images. Raises ConfigError if that is
     another: the principal point is off the middle along both sides, in the same way."""
     c, size = camera, (2 * camera.cx + 1, 2 * camera.cy + 1)
     if min(size) < 1:

@@ -35,7 +35,7 @@ _MAGNITUDES = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
 
 @dataclass(frozen=True)
 class Columns:
-    """Where stamp, position x y z and quaternion x y z w are in a line of ``count`` cells; without a stamp
+    """Places of stamp, position x y z and quaternion x y z w in a line of ``count`` cells; without a stamp
     seven places. ``stamps_a_second`` is what the header says, 1 for seconds; ``nanoseconds`` the place of
     what comes to whole seconds."""
 

@@ -1,4 +1,4 @@
-"""What a recording itself says of its sensor, put into the parameters: the noise of depth that a stereo
+"""A recording's own facts of its sensor, put into the parameters: the noise of depth that a stereo
 calibration gives, how far depths reach, and that a lidar's beams pass what fills only a part of a voxel."""
 
 from dataclasses import replace
@@ -124,8 +124,8 @@ def _some_depths(dataset: Dataset) -> NDArray[np.float32]:
 
 
 def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
-    """Where measurements end but for a hundredth, or where sigma gets too large; whole metres, and no less
-    than the default."""
+    """Depth, in whole metres and no less than the default, at which measurements end but for a hundredth, or
+    sigma gets too large."""
     least = SensorConfig().max_depth
     most = float(np.quantile(depths_m, 0.99)) if depths_m.size else least
     tried = np.arange(least, max(most, least) + 0.5, 0.5)

@@ -55,7 +55,7 @@ class Recording(Table[RecordedFrame]):
 
     @property
     def stated(self) -> StatedSensor:
-        """What the confidence is relative to, which only some folders hold."""
+        """Sigma that the confidence is relative to, which only some folders hold."""
         return replace(super().stated, pixel_sigma=any(row.confidence_file is not None for row in self.rows))
 
     def load(self, index: int, row: RecordedFrame, T_world_camera: Pose) -> Frame:

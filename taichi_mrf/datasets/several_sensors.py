@@ -46,7 +46,7 @@ class SensorEntry:
     """Its recording, as ``taichi-mrf map`` takes it; a path is relative to the file."""
 
     name: str = ""
-    """What its frames' names begin with; sensor-1, sensor-2, ... by default."""
+    """Beginning of its frames' names; sensor-1, sensor-2, ... by default."""
 
     sigma: tuple[float, ...] | None = None
     """Standard deviation of its depth in metres, coefficients in ascending powers of depth, for all pixels.

@@ -149,7 +149,7 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
 
 
 def _same_poses(sample: Sample) -> bool:
-    """Whether the poses say that the sensor does not move."""
+    """True if the poses say that the sensor does not move."""
     return len(sample.poses) > 0 and np.allclose(sample.poses, sample.poses[0], rtol=0, atol=1e-6)
 
 

@@ -9,7 +9,7 @@ import asyncio
 import sys
 import warnings
 import webbrowser
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Any
 
@@ -51,15 +51,17 @@ class LivePage:
         if not hasattr(m, "add_keyframe"):
             raise ArgumentTypeError(f"m must be a map that takes keyframes, such as MRFMap, not {shown(m)}")
         self.url, self._revision = "", -1
-        self._viewer = None if link is not None else ViewerLink(host, port)
+        self._updates: asyncio.Task[None] | None = None
         source = Source(type(m).__name__, m.config, lambda: m, own=True)
-        self._session = Session(source, link or self._viewer, Policy(), self._listening)  # type: ignore[arg-type]
-        while self._viewer is not None and not self.url:
-            self._answer()
-            if self._viewer.lost is not None:
-                self._viewer.close()
-                raise ViewerError(self._viewer.lost)
-            self._viewer.wait(0.1)
+        with ExitStack() as stack:
+            line = link or stack.enter_context(ViewerLink(host, port))
+            self._session = Session(source, line, Policy(), self._listening)
+            while link is None and not self.url:
+                self._session.answer()
+                if line.lost is not None:
+                    raise ViewerError(line.lost)
+                line.wait(0.1)
+            self._open = stack.pop_all()
         if browser and not webbrowser.open(self.url):
             warnings.warn(f"no browser can be opened here; the map is at {self.url}", stacklevel=2)
 
@@ -70,7 +72,7 @@ class LivePage:
         """
         run = self._session.state
         run.look_at_keyframes()
-        self._answer()
+        self._session.answer()
         if not run.is_over:
             run.publish()
             revision = run.mapper.map.view.pool.revision
@@ -89,8 +91,7 @@ class LivePage:
 
     def close(self) -> None:
         """End the page; the map stays."""
-        if self._viewer is not None:
-            self._viewer.close()
+        self._open.close()
 
     def __enter__(self) -> "LivePage":
         return self
@@ -102,7 +103,8 @@ class LivePage:
 
     def _repr_html_(self) -> str:
         """The page inside a notebook, which keeps it up to date while it waits for its next cell."""
-        asyncio.get_running_loop().create_task(self._keep_up_to_date())
+        if self._updates is None:  # it is kept, because an event loop holds its tasks only weakly
+            self._updates = asyncio.get_running_loop().create_task(self._keep_up_to_date())
         return f'<iframe src="{self.url}" width="100%" height="600" style="border: 0"></iframe>'
 
     async def _keep_up_to_date(self) -> None:
@@ -110,11 +112,7 @@ class LivePage:
             await asyncio.sleep(IN_NOTEBOOK_S)
 
     def _listening(self, where: Listening) -> None:
-        host = f"[{where.host}]" if ":" in where.host else where.host
-        self.url = f"http://{host}:{where.port}"
-
-    def _answer(self) -> None:
-        self._session.answer()
+        self.url = where.url
 
 
 def live(m: OccupancyMap, **options: Any) -> LivePage:
@@ -146,5 +144,5 @@ def show(m: OccupancyMap, *, browser: bool = True, **options: Any) -> LivePage:
 
 
 def _in_notebook() -> bool:
-    """Whether the program is a notebook's kernel, whose event loop runs between its cells."""
+    """True if the program is a notebook's kernel, whose event loop runs between its cells."""
     return "ipykernel" in sys.modules

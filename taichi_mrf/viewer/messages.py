@@ -281,6 +281,12 @@ class Listening(Request):
     host: str
     port: int
 
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"
+
 
 @dataclass(frozen=True)
 class Pause(Request):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import CAMERA, FORMATS, Content, quaternion_of, stamped_line
+from broken_recordings import body, opengl, w_first
+from datasets_recordings import CAMERA, FORMATS, Content, stamped_line
 from every_format import EVERY
 
 from taichi_mrf.datasets import open_dataset
@@ -21,32 +22,17 @@ ORIGIN = np.array([412_345.25, 5_412_345.75, 312.5])
 MOUNTING = (0.1, -0.2, 0.3, 0.5, -0.5, 0.5, -0.5)
 
 
-def with_w_first(T: Pose) -> Pose:
-    """What a reader of x y z w makes of a file with w x y z."""
-    x, y, z, w = quaternion_of(T[:3, :3])
-    return pose_from_quaternion(np.array([*T[:3, 3], w, x, y, z]))
-
-
 def on_mounting(T: Pose) -> Pose:
     return T @ inverse(pose_from_quaternion(np.array(MOUNTING)))
 
 
-def gl(T: Pose) -> Pose:
-    return T @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def body(T: Pose) -> Pose:
-    """x ahead is the camera's z, y to the left its -x, z up its -y."""
-    return np.column_stack([T[:, 2], -T[:, 0], -T[:, 1], T[:, 3]])
-
-
 WRITTEN: dict[str, tuple[Callable[[Pose], Pose], dict]] = {
     "inverse": (inverse, {"poses_are": "inverse"}),
-    "opengl": (gl, {"poses_are": "opengl"}),
+    "opengl": (opengl, {"poses_are": "opengl"}),
     "ros": (body, {"poses_are": "ros"}),
-    "w first": (with_w_first, {"poses_are": "wxyz"}),
-    "inverse, opengl": (lambda T: inverse(gl(T)), {"poses_are": "opengl,inverse"}),
-    "w first, inverse": (lambda T: with_w_first(inverse(T)), {"poses_are": "wxyz,inverse"}),
+    "w first": (w_first, {"poses_are": "wxyz"}),
+    "inverse, opengl": (lambda T: inverse(opengl(T)), {"poses_are": "opengl,inverse"}),
+    "w first, inverse": (lambda T: w_first(inverse(T)), {"poses_are": "wxyz,inverse"}),
     "mounting": (on_mounting, {"mounting": MOUNTING}),
 }
 

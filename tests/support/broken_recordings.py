@@ -4,16 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from datasets_recordings import quaternion_of
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.timed_poses import TimedPoses, quaternion
-from taichi_mrf.datasets.trajectories import rotation_of
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.frame import Frame
-
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-ROS_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""T_body_camera: x of the body is ahead, which is z of the camera."""
 
 FLAGS = {
     "inverse": "--poses-are inverse",
@@ -34,12 +31,20 @@ def of_poses(change: Callable[[np.ndarray], np.ndarray]) -> Break:
     return lambda frames: [replace(f, T_world_camera=change(f.T_world_camera)) for f in frames]
 
 
-def _w_first(T: np.ndarray) -> np.ndarray:
-    """What a reader of x y z w makes of w x y z."""
-    x, y, z, w = quaternion(T[:3, :3])
-    read = T.copy()
-    read[:3, :3] = rotation_of(np.array([w, x, y, z]))
-    return read
+def opengl(T: np.ndarray) -> np.ndarray:
+    """The pose of the same camera with y up and z back."""
+    return T @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def body(T: np.ndarray) -> np.ndarray:
+    """The pose of a body whose x is the camera's z, whose y is its -x, and whose z is its -y."""
+    return np.column_stack([T[:, 2], -T[:, 0], -T[:, 1], T[:, 3]])
+
+
+def w_first(T: np.ndarray) -> np.ndarray:
+    """The pose that a reader of x y z w makes of w x y z."""
+    x, y, z, w = quaternion_of(T[:3, :3])
+    return pose_from_quaternion(np.array([*T[:3, 3], w, x, y, z]))
 
 
 def of_depth(change: Callable[[Frame], np.ndarray]) -> Break:
@@ -71,9 +76,9 @@ def of_camera(factor: float) -> Break:
 LATE_S = 0.3
 BREAKS: dict[str, Break] = {
     "inverse": of_poses(inverse),
-    "wxyz": of_poses(_w_first),
-    "opengl": of_poses(lambda T: T @ OPENGL),
-    "ros": of_poses(lambda T: T @ inverse(ROS_OPTICAL)),
+    "wxyz": of_poses(w_first),
+    "opengl": of_poses(opengl),
+    "ros": of_poses(body),
     "unit": of_depth(lambda f: np.rint(1000 * f.depth_m) / 5000),  # millimetres, read as TUM RGB-D's
     "range": of_depth(lambda f: f.depth_m * np.linalg.norm(f.camera.rays(), axis=-1)),
     "late": late(LATE_S),

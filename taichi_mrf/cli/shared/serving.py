@@ -37,10 +37,8 @@ def print_address(
 ) -> None:
     """Print the page's address, and before it that another port was taken than the requested one (0: any);
     open a browser if asked."""
-    host = f"[{where.host}]" if ":" in where.host else where.host
-    address = f"http://{host}:{where.port}"
     if wanted_port not in (0, where.port):
         print_line(f"Port {wanted_port} is busy, so the page took {where.port}.")
-    print_line(f"{what} is at {address}  (Ctrl-C ends it)")
+    print_line(f"{what} is at {where.url}  (Ctrl-C ends it)")
     if open_browser:
-        webbrowser.open(address)
+        webbrowser.open(where.url)

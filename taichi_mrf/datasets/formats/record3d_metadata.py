@@ -31,7 +31,7 @@ _NO_POSE = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 @dataclass(frozen=True)
 class Metadata:
-    """What is in the metadata. ``where`` is what errors call them, ``depth_shape`` (height, width), None if
+    """Content of the metadata. ``where`` is what errors call them, ``depth_shape`` (height, width), None if
     it is missing; ``poses`` is (N, 7), ``intrinsics`` (N, 4), both with no row if they are missing."""
 
     where: str

@@ -51,7 +51,7 @@ class LidarRecording(Dataset):
 
     @property
     def stated(self) -> StatedSensor:
-        """What is assumed for every lidar, and the largest range of the first scan."""
+        """Facts that are assumed for every lidar, and the largest range of the first scan."""
         return StatedSensor(
             (LIDAR_SIGMA_M,),
             origin="assumed for a lidar",

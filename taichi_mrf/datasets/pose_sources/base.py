@@ -49,7 +49,7 @@ class PoseKind:
     name: str
 
     looks_for: str
-    """What makes a file one of this kind, as error messages list it."""
+    """Marks of a file of this kind, as error messages list it."""
 
     recognises: Callable[[Path], bool]
     """True if a file is of this kind, even if it is damaged."""

@@ -60,7 +60,7 @@ class FramePoses:
 
     @property
     def warning(self) -> str | None:
-        """What a user should know of poses that belong to no frame."""
+        """Warning of poses that belong to no frame."""
         if not self.unknown:
             return None
         names = ", ".join(self.unknown[:NAMED_UNKNOWN]) + (

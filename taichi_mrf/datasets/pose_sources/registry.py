@@ -27,7 +27,7 @@ def _poses_in(trajectory: Trajectory) -> ChangedPoses:
 
 
 def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], PoseSource]:
-    """What opens a text file that ``read`` reads."""
+    """Opener of a text file that ``read`` reads."""
 
     def open_file(path: Path, query: str) -> WatchedFile:
         if query:

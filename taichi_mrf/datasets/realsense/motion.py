@@ -121,7 +121,7 @@ def motion_or_note(
 
 
 def recorded_motion(rs: Any, path: Path) -> MotionModule:
-    """What the IMU measured while a recording with depth was made, stopped. Raises as MotionModule does."""
+    """Measurements of the IMU while a recording with depth was made, stopped. Raises as MotionModule does."""
     context = rs.context()
     device = context.load_device(str(path))
     device.set_real_time(False)

@@ -140,7 +140,7 @@ def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
 
 
 def _compressed(message: Any) -> tuple[NDArray, float]:
-    """The same of a CompressedImage."""
+    """The values of a CompressedImage, (H, W), and how many of their steps are a metre."""
     data = bytes(message.data)
     check_depth(message.format)
     kind, _, packing = map(str.strip, message.format.partition(";"))

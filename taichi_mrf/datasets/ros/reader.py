@@ -75,7 +75,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a message is: recorded at ``recorded_ns``, the ``ordinal``-th of its topic (from 0) then."""
+    """Place of a message: recorded at ``recorded_ns``, the ``ordinal``-th of its topic (from 0) then."""
 
     recorded_ns: int
     ordinal: int

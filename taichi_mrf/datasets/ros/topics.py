@@ -53,7 +53,7 @@ def packed_otherwise(reader: RosReader) -> list[str]:
 
 
 def no_depth(reader: RosReader) -> str:
-    """What a bag without topics of depth images contains, and which of it might be read."""
+    """Content of a bag without topics of depth images, and which of it might be read."""
     images = {topic.name: topic.encoding for topic in image_topics(reader)}
     held = [f"{t.name} ({images.get(t.name) or t.type.rpartition('/')[2]})" for t in reader.topics.values()]
     text = (

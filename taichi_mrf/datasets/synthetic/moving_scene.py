@@ -135,7 +135,7 @@ class MovingScene:
 
 
 def placed(solids: Iterable[Solid], place: Place) -> tuple[Solid, ...]:
-    """The same solids, turned about the vertical through the origin and moved to a place."""
+    """Copy of the solids, turned about the vertical through the origin and moved to a place."""
     c, s = math.cos(place.yaw), math.sin(place.yaw)
     moved = []
     for solid in solids:
