@@ -1,5 +1,6 @@
 """A picture of two frames on top of each other: as they were read, and as they explain each other."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +11,7 @@ from taichi_mrf.doctor.views import thinned
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _POINTS = 200_000
-_WIDEST = 640
+_NARROWEST, _WIDEST = 480, 640
 _GAP = 8
 _AGREES = 0.05
 _GREEN, _RED, _BLUE = (60, 200, 80), (230, 60, 50), (60, 110, 240)
@@ -27,9 +28,19 @@ def overlap(diagnosis: Diagnosis) -> NDArray[np.uint8] | None:
     # The pair that shows it best: explained now, and least so before.
     shown = np.where(search.usable() & ~np.isnan(after), np.nan_to_num(before) - 2 * after, -np.inf)
     pair = int(np.argmax(shown))
-    left, right = (_panel(search, pair, reading) for reading in (search.given, diagnosis.reading))
+    left = _labelled(_panel(search, pair, search.given), "as read")
+    right = _labelled(_panel(search, pair, diagnosis.reading), "mended")
     between = np.full((len(left), _GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([left, between, right], axis=1)
+
+
+def _labelled(panel: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """The panel, large enough to be looked at, with a label in its corner."""
+    times = max(1, _NARROWEST // panel.shape[1])
+    large = np.ascontiguousarray(panel.repeat(times, axis=0).repeat(times, axis=1))
+    for color, width in ((0, 4), (255, 1)):  # white with a black edge reads on any ground
+        cv2.putText(large, text, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (color,) * 3, width, cv2.LINE_AA)
+    return large
 
 
 def _panel(search: Search, pair: int, reading: Reading) -> NDArray[np.uint8]:
