@@ -20,6 +20,7 @@ from taichi_mrf.session.link import Link, ViewerLink
 from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.source import Source
+from taichi_mrf.system.interrupts import interrupts_noted
 from taichi_mrf.viewer.messages import Listening
 
 PORT = 8080
@@ -85,9 +86,9 @@ class LivePage:
     def serve(self) -> None:
         """Answer the page until it ends or Ctrl-C is pressed. Edits are inferred at once, and the page shows
         what is occupied."""
-        self.update()
-        with suppress(KeyboardInterrupt):
-            self._session.run(lambda: False)
+        with interrupts_noted() as stopped:
+            self.update()
+            self._session.run(stopped)
 
     def close(self) -> None:
         """End the page; the map stays."""
@@ -136,11 +137,12 @@ def show(m: OccupancyMap, *, browser: bool = True, **options: Any) -> LivePage:
         page = LivePage(m, **options)
         page.update()
         return page
-    with LivePage(m, browser=browser, **options) as page:
+    page = LivePage(m, browser=browser, **options)
+    with page, suppress(KeyboardInterrupt):
         if not browser:
             warnings.warn(f"the map is at {page.url}", stacklevel=2)
         page.serve()
-        return page
+    return page
 
 
 def _in_notebook() -> bool:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from taichi_mrf.system.interrupts import interrupts_wait
+from taichi_mrf.system.interrupts import interrupts_noted, interrupts_wait
 
 
 @pytest.mark.usefixtures("own_interrupts")
@@ -51,3 +51,15 @@ def test_another_thread_is_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [handler]
+
+
+@pytest.mark.usefixtures("own_interrupts")
+def test_the_first_ctrl_c_is_noted_and_the_second_raises() -> None:
+    with interrupts_noted() as came:
+        assert not came()
+        signal.raise_signal(signal.SIGINT)
+        assert came()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
