@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.methods.capabilities import has_dates, has_layers
-from taichi_mrf.methods.mrf.layers import NOTHING_MOVES, Moving
+from taichi_mrf.methods.mrf.moving_voxels import NOTHING_MOVES, Moving
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.session.live_keyframes import LiveKeyframe
 from taichi_mrf.session.publish import Publisher

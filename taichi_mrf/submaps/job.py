@@ -13,6 +13,7 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.submaps.plan import Plan, Submap
 from taichi_mrf.system.atomic import write_text
+from taichi_mrf.voxels.layers import COLORS, FIRST, SURFACE
 
 PLAN_FILE = "plan.json"
 
@@ -48,6 +49,12 @@ class Job:
     centres_m: dict[int, tuple[float, float, float]]
     skipped: dict[str, str]
     up: str = ""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers of the map beside log-odds."""
+        measured = (SURFACE, FIRST) if self.config.keep_surface else ()
+        return (COLORS, *measured) if self.config.color else measured
 
     def write(self, folder: Path) -> None:
         """Write the plan's file. Raises MapFileError."""

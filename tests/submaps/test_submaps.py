@@ -36,6 +36,7 @@ from taichi_mrf.submaps.plan import SeenKeyframe, chunks_for, plan_submaps
 from taichi_mrf.submaps.round_files import read_core, read_report, round_path
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.submaps.task import share_moved
+from taichi_mrf.voxels.layers import LOG_ODDS
 from taichi_mrf.voxels.layout import CHUNK
 
 zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
@@ -321,7 +322,7 @@ def test_a_killed_worker_changes_nothing(exchanged: Path, tmp_path: Path) -> Non
     ours, theirs = ChunkedMap.open(tmp_path / "map.zarr"), ChunkedMap.open(exchanged / "map.zarr")
     np.testing.assert_array_equal(ours.chunks, theirs.chunks)
     for place in ours.chunks:
-        np.testing.assert_array_equal(ours.store.read(place), theirs.store.read(place))
+        np.testing.assert_array_equal(ours.store.read(LOG_ODDS, place), theirs.store.read(LOG_ODDS, place))
     assert len(result.rounds) == 2
 
 

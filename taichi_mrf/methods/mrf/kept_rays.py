@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference.brick_sums import BrickSums
 from taichi_mrf.voxels.distance_field import VALUES, DistanceField
+from taichi_mrf.voxels.layers import FIRST, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 
 STEPS = 1024.0
@@ -44,6 +45,12 @@ class RayShare:
         """The part of it in some chunks (n, 3), or the part outside of them."""
         both = (self.distances, self.votes)
         return RayShare(*(sums.chosen(sums.inside(chunks) == inside) for sums in both))
+
+    @property
+    def layers(self) -> dict[str, BrickValues]:
+        """The distances and the votes as layers."""
+        won = (self.votes.sums[..., 0] > 0).astype(np.uint8)
+        return {SURFACE: self.field.values, FIRST: BrickValues(self.votes.bricks, won)}
 
     @property
     def field(self) -> DistanceField:

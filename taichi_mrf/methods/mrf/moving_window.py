@@ -21,17 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import (
-    StorableMap,
-    chunk_block,
-    extra_block,
-    first_block,
-    header_of,
-    voxel_block,
-)
-from taichi_mrf.export.chunk_store import Chunk
-from taichi_mrf.export.growing_store import Extras
-from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
+from taichi_mrf.export.chunk_blocks import StorableMap, header_of
+from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.brick_registry import Bricks
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
@@ -40,6 +31,15 @@ from taichi_mrf.methods.mrf.surfacing import measured_bricks, surface_field
 from taichi_mrf.queries.known_bricks import bricks_between
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layers import (
+    COLORS,
+    FIRST,
+    LOG_ODDS,
+    SURFACE,
+    BrickValues,
+    Chunk,
+    known_log_odds,
+)
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, by_chunk, grid_keys
 
 LEAVE = 1.25
@@ -185,19 +185,12 @@ class MovingWindow:
         """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""
         slots = self._slots_in(chunks)
         contents = self._contents(chunks, slots)
-        extras: dict[str, dict[Chunk, NDArray]] = {}
+        layers = {LOG_ODDS: self._voxels(chunks, header)}
         if self._parts.colors:
-            extras[COLORS] = {
-                chunk: voxel_block(chunk, found.colors.bricks, found.colors.numbers, found.colors.colors())
-                for chunk, found in contents.items()
-            }
+            layers[COLORS] = self._parts.colors.frozen_in(chunks).values
         if self._parts.kept.wanted:
-            extras[SURFACE] = {
-                chunk: _distances(chunk, found.rays.field) for chunk, found in contents.items()
-            }
-            votes = {chunk: found.rays.votes for chunk, found in contents.items()}
-            extras[FIRST] = {c: first_block(c, v.bricks, v.sums[..., 0] > 0) for c, v in votes.items()}
-        self.parked.add(contents, self._voxels(chunks, header), extras, header)
+            layers |= self._parts.kept.share.in_chunks(chunks).layers
+        self.parked.add(contents, layers, header)
         self._registry.leave(slots, chunks)
         self._parts.surfels.release(chunks)
         self._parts.colors.release(chunks)
@@ -231,40 +224,29 @@ class MovingWindow:
         return contents
 
     def _resident(
-        self,
-        header: StoreHeader,
-        surface: DistanceField | None,
-        first: NDArray[np.bool_] | None,
-    ) -> Iterator[tuple[dict[Chunk, NDArray[np.float32]], Extras]]:
-        """The voxels of all chunks in memory, some at a time, with their colours if these are known, with the
-        distances of ``surface``, and with the voxels (slots, 512) that rays take for their ``first`` surface.
-        """
+        self, header: StoreHeader, surface: DistanceField | None, first: NDArray[np.bool_] | None
+    ) -> Iterator[tuple[NDArray[np.int32], dict[str, BrickValues]]]:
+        """All chunks in memory with their layers, some at a time: colours if these are known, the distances
+        of ``surface``, and the voxels (slots, 512) that rays take for their ``first`` surface."""
         measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
         footprints = [k.footprint for k in self._parts.keyframes.values()]
         crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
         chunks = _distinct(np.concatenate([self._chunks_in_memory(), measured, *crossed]))
         for begin in range(0, len(chunks), _AT_ONCE):
             some = chunks[begin : begin + _AT_ONCE]
-            extras: dict[str, dict[Chunk, NDArray]] = {}
             slots = self._slots_in(some)
-            colors, bricks = (
-                self._parts.colors.stored(slots, self._parts.settled),
-                self._registry.pool.bricks[slots],
-            )
-            rows_of = dict(by_chunk(bricks))
+            bricks, layers = self._registry.pool.bricks[slots], {}
+            colors = self._parts.colors.stored(slots, self._parts.settled)
             if len(colors):
-                extras[COLORS] = {
-                    c: extra_block(c, bricks[rows], colors[rows]) for c, rows in rows_of.items()
-                }
+                layers[COLORS] = BrickValues(bricks, colors)
             if first is not None:
-                here = first[slots]
-                extras[FIRST] = {c: first_block(c, bricks[rows], here[rows]) for c, rows in rows_of.items()}
+                layers[FIRST] = BrickValues(bricks, first[slots].astype(np.uint8))
             if surface is not None:
-                extras[SURFACE] = {(x, y, z): _distances((x, y, z), surface) for x, y, z in some.tolist()}
-            yield self._voxels(some, header), extras
+                layers[SURFACE] = surface.values.in_chunks(some)
+            yield some, {LOG_ODDS: self._voxels(some, header), **layers}
 
-    def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> dict[Chunk, NDArray[np.float32]]:
-        """(64, 64, 64) log-odds of some chunks (n, 3), NaN for unknown."""
+    def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> BrickValues:
+        """Log-odds of the bricks in some chunks (n, 3)."""
         topology, pool = self._registry.topology, self._registry.pool
         all_bricks = _bricks_of(chunks)
         slots = topology.slots(all_bricks)
@@ -272,12 +254,7 @@ class MovingWindow:
         bricks = np.concatenate([all_bricks[has_voxels], all_bricks[is_free]])
         empty = np.full((int(is_free.sum()), VOXELS), header.seen_free_log_odds, np.float32)
         log_odds = np.concatenate([pool.read("belief", slots[has_voxels]), empty])
-        rows_of = dict(by_chunk(bricks))
-        blocks = {}
-        for x, y, z in chunks.tolist():
-            rows = rows_of.get((x, y, z), _NONE)
-            blocks[x, y, z] = chunk_block((x, y, z), bricks[rows], log_odds[rows], header.prior_log_odds)
-        return blocks
+        return BrickValues(bricks, known_log_odds(log_odds, header.prior_log_odds))
 
     def _slots_in(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
         """The slots of the bricks in some chunks (n, 3), by their coordinates."""
@@ -307,11 +284,6 @@ class MovingWindow:
         beside = np.maximum(np.maximum(lower - position_m, position_m - (lower + side_m)), 0.0)
         distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
         return distances
-
-
-def _distances(chunk: Chunk, surface: DistanceField) -> NDArray[np.float32]:
-    """(64, 64, 64, 2) weights and distances of a chunk."""
-    return np.stack(surface.box(np.array(chunk, np.int64) * CHUNK_VOXELS, CHUNK_VOXELS), axis=-1)
 
 
 def _distinct(chunks: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -9,8 +9,8 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.mrf.calibrated import calibrate, carry
 from taichi_mrf.methods.mrf.inferring import restore_messages
-from taichi_mrf.methods.mrf.layers import layer_of
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
+from taichi_mrf.methods.mrf.moving_voxels import layer_of
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.surfacing import LEAST, surface_field
 from taichi_mrf.methods.protocol import OccupancyMap
