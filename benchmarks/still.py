@@ -17,8 +17,8 @@ from taichi_mrf.cli.options.config_file import live_defaults
 from taichi_mrf.config.schema import Config
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.session import change_list
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import open_source
 from taichi_mrf.viewer.messages import KeyframeInfo, Request, SceneChanges, Update
 

@@ -1,8 +1,6 @@
 """The state of a live run: its source, its map, and the connection to its page."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
@@ -25,22 +23,11 @@ from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.session.pictures import outlined
 from taichi_mrf.session.progress import Progress
 from taichi_mrf.session.replay import Replay
-from taichi_mrf.session.session_core import SessionCore
+from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
 from taichi_mrf.session.shown_map import time_span
 from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Rules that a run follows on its own. ``keep_live``: most keyframes that are on before some are frozen,
-    None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
-    source has ended and the map is settled."""
-
-    keep_live: int | None = None
-    out: Path | None = None
-    leave_when_done: bool = False
 
 
 class Run(SessionCore):
@@ -54,8 +41,8 @@ class Run(SessionCore):
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
         """Makes the map. Raises TaichiMRFError."""
-        super().__init__(link)
-        self.source, self.policy = source, policy
+        super().__init__(link, policy)
+        self.source = source
         self.version = 0
         self.full: str | None = None
         self.replay: Replay | None = None
@@ -164,7 +151,7 @@ class Run(SessionCore):
 
     def show_activity(self, activity: str, share: float) -> None:
         """Show the present activity in the viewer, and the share of it that is done, 0 to 1."""
-        waiting = self.inbox.has_edits()
+        waiting = self.waiting.has_edits()
         self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
 
     def notice_error(self, error: Exception) -> None:
@@ -215,8 +202,15 @@ class Run(SessionCore):
         poses_may_change = self.follower is not None and not self.follower.is_final
         return not (frames_left or poses_may_change or self.mapper.unsettled or self.mapper.unaligned)
 
+    def idle(self) -> float:
+        """Show why there is nothing to do; returns the seconds until the next frame, if one is due earlier
+        than requests are looked at."""
+        self.show_activity(self._idle_activity, 1.0)
+        due = self.replay.due_in() if self.replay else None
+        return WAIT_SECONDS if due is None else min(due, WAIT_SECONDS)
+
     @property
-    def idle_activity(self) -> str:
+    def _idle_activity(self) -> str:
         """In words, why there is nothing to do."""
         if self.replay is None:
             return "waiting: the map is up to date"

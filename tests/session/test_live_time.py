@@ -13,8 +13,8 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Bricks, SceneChanges, ShowTime, Switch, TimeSpan

@@ -30,7 +30,7 @@ _DPI = 120
 
 
 @dataclass(frozen=True)
-class Outcome:
+class MethodResult:
     """Result of one method."""
 
     solution: Solution
@@ -39,8 +39,8 @@ class Outcome:
     """None without a floor plan."""
 
 
-def write_outcome(
-    folder: Path, name: str, method: str, outcome: Outcome, way_x_y: NDArray[np.float64]
+def write_result(
+    folder: Path, name: str, method: str, outcome: MethodResult, way_x_y: NDArray[np.float64]
 ) -> list[Path]:
     """Write the map and the energies of one method into a folder; returns the paths. Raises MapFileError."""
     laser_map = outcome.map
@@ -52,7 +52,7 @@ def write_outcome(
     return paths + write_energies(folder, name, {method: outcome})
 
 
-def write_energies(folder: Path, name: str, outcomes: Mapping[str, Outcome]) -> list[Path]:
+def write_energies(folder: Path, name: str, outcomes: Mapping[str, MethodResult]) -> list[Path]:
     """Write ``energy.csv`` (with a column for the method, if there are several) and ``energy.png``."""
     write_text(folder / "energy.csv", energy_csv(outcomes))
     traces, duals = {}, {}
@@ -73,7 +73,7 @@ def write_comparison(
     return [_write_figure(folder / "maps.png", comparison_figure(maps, way_x_y, plan))]
 
 
-def energy_csv(outcomes: Mapping[str, Outcome]) -> str:
+def energy_csv(outcomes: Mapping[str, MethodResult]) -> str:
     """Seconds, iteration, energy and dual of every step; a dual that a method does not have is left empty."""
     several = len(outcomes) > 1
     out = io.StringIO()

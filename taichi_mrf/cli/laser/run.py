@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import taichi_mrf
-from taichi_mrf.cli.laser.files import Outcome, write_comparison, write_energies, write_outcome
+from taichi_mrf.cli.laser.files import MethodResult, write_comparison, write_energies, write_result
 from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
@@ -111,9 +111,9 @@ def _solve_all(
     registration: Registration | None,
     bar: ProgressBar,
     request: StopRequest,
-) -> dict[str, Outcome]:
+) -> dict[str, MethodResult]:
     """Each run's outcome, until the run is to stop: that of the first is kept in any case."""
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, MethodResult] = {}
     for name, settings in options.runs().items():
         if outcomes and request():
             break
@@ -124,7 +124,7 @@ def _solve_all(
         if registration is not None:
             truth = true_cells(registration.plan, laser_map, scans.pose_x_y_theta[:, :2])
             scores = floor_plan_scores(laser_map, truth)
-        outcomes[name] = Outcome(solution, laser_map, scores)
+        outcomes[name] = MethodResult(solution, laser_map, scores)
     return outcomes
 
 
@@ -154,7 +154,7 @@ def _laser_map(graph: FactorGraph, solution: Solution) -> LaserMap:
 
 
 def _write(
-    options: Laser, scans: LaserScans, outcomes: dict[str, Outcome], registration: Registration | None
+    options: Laser, scans: LaserScans, outcomes: dict[str, MethodResult], registration: Registration | None
 ) -> list[Path]:
     """The maps first: they are what the time went into."""
     way = scans.pose_x_y_theta[:, :2]
@@ -163,7 +163,7 @@ def _write(
     for name, outcome in outcomes.items():
         folder = options.out / name if several else options.out
         folder.mkdir(exist_ok=True)
-        written += write_outcome(folder, scans.name, name, outcome, way)
+        written += write_result(folder, scans.name, name, outcome, way)
     if several:
         written += write_energies(options.out, scans.name, outcomes)
         maps = {name: outcome.map for name, outcome in outcomes.items()}
@@ -185,7 +185,7 @@ def laser_report(
     source: str,
     scans: LaserScans,
     graph: FactorGraph,
-    outcomes: Mapping[str, Outcome],
+    outcomes: Mapping[str, MethodResult],
     registration: Registration | None,
     seconds: Mapping[str, float],
     interrupted: bool,
@@ -216,7 +216,7 @@ def laser_report(
     }
 
 
-def comparison_table(name: str, outcomes: Mapping[str, Outcome]) -> Table:
+def comparison_table(name: str, outcomes: Mapping[str, MethodResult]) -> Table:
     """A row for each method, in the order in which they ran."""
     judged = any(outcome.scores for outcome in outcomes.values())
     columns = ["method", "energy", "dual bound", "seconds", "explained %"]
@@ -246,12 +246,12 @@ def _entries(scores: CellScores) -> list[Entry]:
     return [scores.precision, scores.recall, scores.iou]
 
 
-def _seconds(outcome: Outcome) -> float:
+def _seconds(outcome: MethodResult) -> float:
     trace = outcome.solution.trace
     return trace[-1].seconds if trace else 0.0
 
 
-def _method_report(outcome: Outcome) -> dict[str, Any]:
+def _method_report(outcome: MethodResult) -> dict[str, Any]:
     solution = outcome.solution
     return {
         "energy": solution.energy,
