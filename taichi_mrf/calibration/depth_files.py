@@ -23,8 +23,6 @@ STACK_NAME = "depth_m"
 
 @dataclass(frozen=True)
 class _Listed:
-    """File that holds a depth image."""
-
     path: Path
     number: int | None
     """Position in the stack; None where the file is one image."""

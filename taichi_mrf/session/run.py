@@ -1,9 +1,12 @@
 """The state of a live run: its source, its map, and the connection to its page."""
 
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Collection
 
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
@@ -14,20 +17,79 @@ from taichi_mrf.methods.capabilities import (
     takes_colors,
     window_of,
 )
+from taichi_mrf.methods.protocol import MapStatistics
 from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.link import Link
-from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.pictures import outlined
-from taichi_mrf.session.progress import Progress
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
-from taichi_mrf.session.shown_map import time_span
+from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
+from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice, Status, TimeSpan
+
+RATE_SECONDS = 5.0
+"""Seconds over which the keyframe rate is averaged."""
+
+
+class Progress:
+    """Makes Status messages."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._taken: deque[float] = deque()
+        self._begin = clock()
+        self._measured: MapStatistics | None = None
+
+    def keyframe_taken(self) -> None:
+        """Count a keyframe for the rate."""
+        self._taken.append(self._clock())
+
+    def measure(self, mapper: Mapper) -> None:
+        """Measure the map's size, which takes too long for every message."""
+        self._measured = mapper.map.statistics()
+
+    def status(
+        self, activity: str, share: float, replay: Replay | None, mapper: Mapper, waiting: bool
+    ) -> Status:
+        """``waiting``: edits wait until the present work is done."""
+        if self._measured is None:
+            self.measure(mapper)
+        assert self._measured is not None
+        states = [entry.state for entry in mapper.roster.entries.values()]
+        return Status(
+            activity,
+            share,
+            replay.number if replay else 0,
+            replay.frames if replay else 0,
+            states.count("on"),
+            states.count("frozen"),
+            self._rate(),
+            self._measured.voxels,
+            self._measured.bricks,
+            self._measured.memory_mb,
+            replay.paused if replay else False,
+            replay.finished if replay else True,
+            waiting or mapper.edited,
+            replay.speed if replay and replay.has_pace else None,
+        )
+
+    def _rate(self) -> float:
+        now = self._clock()
+        while self._taken and self._taken[0] < now - RATE_SECONDS:
+            self._taken.popleft()
+        return len(self._taken) / max(min(RATE_SECONDS, now - self._begin), 1e-3)
+
+
+def sweeping(step: InferProgress) -> tuple[str, float]:
+    """A step of full inference in words, and how much of it is done."""
+    done = (step.sweep - 1) * step.keyframes + step.keyframe
+    sentence = f"sweeping keyframe {step.keyframe} of {step.keyframes} (sweep {step.sweep} of {step.sweeps})"
+    return sentence, done / (step.sweeps * step.keyframes)
 
 
 class Run(SessionCore):
@@ -233,3 +295,17 @@ class Run(SessionCore):
     def _show_adding(self, frame: Frame) -> None:
         self.show_camera(frame)
         self.show_activity(f"adding {frame.name}", self.replay.share if self.replay else 0.0)
+
+
+def time_span(shown: ShownMap, entries: Collection[LiveKeyframe]) -> TimeSpan | None:
+    """The times at which a map can be shown; None for a map without dates or keyframes.
+
+    Frozen keyframes count from the newest of them on, and before that the map would lack them.
+    """
+    on = [entry.stamp_s for entry in entries if entry.state == "on"]
+    frozen = [entry.stamp_s for entry in entries if entry.state == "frozen"]
+    if not shown.has_dates or not on + frozen:
+        return None
+    first = max(frozen) if frozen else min(on)
+    start = min(entry.stamp_s for entry in entries)  # also of those that are off, or all times would shift
+    return TimeSpan(start, first, max(on + frozen), shown.stamp_s)

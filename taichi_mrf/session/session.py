@@ -30,11 +30,10 @@ from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.extras import Extras
 from taichi_mrf.session.link import Link
-from taichi_mrf.session.live_keyframes import LiveKeyframe
-from taichi_mrf.session.progress import sweeping
+from taichi_mrf.session.mapper import LiveKeyframe
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.requests import Requests, resumes_replay
-from taichi_mrf.session.run import Run
+from taichi_mrf.session.run import Run, sweeping
 from taichi_mrf.session.session_core import EDITS, Policy
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Listening, Notice, Request
