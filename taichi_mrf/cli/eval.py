@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-from taichi_mrf.cli.options.eval import Eval
+from taichi_mrf.cli.options.measure import Eval
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table

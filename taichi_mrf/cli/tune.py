@@ -138,7 +138,7 @@ def _finish(session: "TuneSession", options: Tune, print_line: PrintLine) -> Non
 
 def _verdict(session: "TuneSession") -> list[str]:
     """The gain of the search on views that it has not used, line by line; empty until it has ended."""
-    from taichi_mrf.tune.verdict import verdict_lines
+    from taichi_mrf.tune.trial import verdict_lines
 
     return verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
 

@@ -21,8 +21,7 @@ from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures, residuals_of
 from taichi_mrf.tune.history import Attempt, History
 from taichi_mrf.tune.search import Search
-from taichi_mrf.tune.trial import Trial, run_trial
-from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen
+from taichi_mrf.tune.trial import Judged, Trial, contenders, judge_unseen, run_trial
 from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
 from taichi_mrf.viewer.messages import File, Hello, Listening, Notice, Quit
 from taichi_mrf.viewer.tune.messages import (
