@@ -99,7 +99,7 @@ _LASER_FLAGS = (
 )
 
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
+    "map": Command(Map, "taichi_mrf.cli.map.run:run_map", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),

@@ -170,7 +170,7 @@ def run_laser(options: Laser) -> int:
         interrupted = request()
         report = laser_report(options.scans, scans, graph, outcomes, registration, seconds, interrupted)
         write_text(options.out / REPORT_FILE, report_json(report))
-        status = 0 if request.signal is None else 128 + request.signal
+        status = request.exit_status
         if options.json:
             print(report_json(report), end="")
             return status

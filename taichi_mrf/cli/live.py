@@ -91,12 +91,10 @@ def run_live(options: Live) -> int:
                 print_line(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)
-    if request.signal is not None:
-        return 128 + request.signal
-    if session.state.full is not None:
+    if session.state.full is not None and not request():
         print_problem(f"out of memory: {session.state.full}; the map of the frames before it is kept")
         return DID_NOT_FIT
-    return 0
+    return request.exit_status
 
 
 class _ProgressLink(ViewerLink):

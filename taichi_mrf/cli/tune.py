@@ -85,7 +85,7 @@ def run_tune(options: Tune) -> int:
         lost = link.lost
     if lost is not None and not request():
         raise TaichiMRFError(lost)
-    return 0 if request.signal is None else 128 + request.signal
+    return request.exit_status
 
 
 def _page(options: Tune, print_line: PrintLine, stack: ExitStack) -> ViewerLink:

@@ -26,6 +26,7 @@ from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.session.pictures import thumbnail
 from taichi_mrf.session.ray_answers import PosedDepthImage
 from taichi_mrf.session.shown_map import ShownMap
+from taichi_mrf.system import runtime
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeState
 
@@ -136,6 +137,20 @@ class Mapper:
     def min_evidence(self) -> float:
         """Voxels whose published log-odds are nearer to the prior than this count as unknown."""
         return LOG_ODDS_STEP if self.map.METHOD.prior_is_unknown else self.map.config.volume.min_evidence
+
+    def hello(self, source: str) -> messages.Hello:
+        """The message that begins the map of a ``source`` in the viewer."""
+        backend = runtime.choice()
+        return messages.Hello(
+            source=source,
+            backend=backend.name if backend else "",
+            device=backend.device if backend else "",
+            method=self.map.config.method,
+            voxel_size=self.map.voxel_size,
+            prior_log_odds=self.map.view.pool.prior_log_odds,
+            min_evidence=self.min_evidence,
+            parameters="",
+        )
 
     @property
     def stale(self) -> bool:

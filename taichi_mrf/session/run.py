@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import replace
 
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
@@ -29,8 +30,7 @@ from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
-from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice, Status, TimeSpan
+from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
 
 RATE_SECONDS = 5.0
 """Seconds over which the keyframe rate is averaged."""
@@ -142,16 +142,10 @@ class Run(SessionCore):
 
     def send_everything(self) -> None:
         """Send a viewer that has just started the whole state."""
-        m, backend = self.mapper.map, runtime.choice()
+        m = self.mapper.map
         self.send(
-            Hello(
-                source=self.source.name,
-                backend=backend.name if backend else "",
-                device=backend.device if backend else "",
-                method=m.config.method,
-                voxel_size=m.voxel_size,
-                prior_log_odds=m.view.pool.prior_log_odds,
-                min_evidence=self.mapper.min_evidence,
+            replace(
+                self.mapper.hello(self.source.name),
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,

@@ -285,7 +285,7 @@ class MapPublisher:
         """Send a map with its keyframes. If grid, prior and keyframes are those of the map before, only
         bricks are sent, so that the picture does not go black in between."""
         before, self._shown = self._shown, Mapper(trial.map)
-        hello, publisher = self._describe(trial), self._shown.shown.publisher
+        hello, publisher = self._shown.hello(self._source), self._shown.shown.publisher
         bricks = publisher.changes() or publisher.everything_gone()
         keyframes = [self._shown.describe(entry) for entry in self._shown.roster.entries.values()]
         names = [keyframe.name for keyframe in keyframes]
@@ -298,20 +298,6 @@ class MapPublisher:
             self._link.send(keyframe)
         self._link.send(merged([*gone, bricks]))
         self._hello = hello
-
-    def _describe(self, trial: Trial) -> Hello:
-        assert self._shown is not None
-        backend = runtime.choice()
-        return Hello(
-            source=self._source,
-            backend=backend.name if backend else "",
-            device=backend.device if backend else "",
-            method=trial.config.method,
-            voxel_size=trial.map.voxel_size,
-            prior_log_odds=trial.map.view.pool.prior_log_odds,
-            min_evidence=self._shown.min_evidence,
-            parameters="",
-        )
 
 
 def _names(mapper: Mapper) -> list[str]:

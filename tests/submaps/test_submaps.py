@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from in_process import InProcess
 from scipy.spatial import KDTree
 from small_room import VOXEL_SIZE, add, frames
 
 from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.cluster.local import LocalProcesses
-from taichi_mrf.cluster.runner import InProcess
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig

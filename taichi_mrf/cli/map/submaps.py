@@ -6,11 +6,9 @@ from typing import Any
 from rich.table import Table
 
 import taichi_mrf
-from taichi_mrf.cli.map.run import exit_status
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.shared.interrupt import interrupt_on_signals
-from taichi_mrf.cli.shared.output import output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.interrupt import StopRequest
+from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import with_absolute_tables
@@ -30,9 +28,9 @@ from taichi_mrf.voxels.layout import VOXELS
 TASK_FOLDER, MAP_FOLDER, PICTURE_FILE = "submaps", "map.zarr", "submaps.png"
 
 
-def run_submaps(options: Map, submap_size: float) -> int:
-    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = open_terminal(options.printing, stderr=options.json)
+def map_submaps(options: Map, console: Terminal, request: StopRequest) -> int:
+    """Map one sequence in submaps; returns the exit status. Raises TaichiMRFError."""
+    assert options.submap_size is not None
     if len(options.sources) != 1:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
@@ -41,38 +39,33 @@ def run_submaps(options: Map, submap_size: float) -> int:
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
     sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
+    if not options.resume:  # which takes its parameters from here
+        _refuse_to_replace(options)
+        (options.out / REPORT_FILE).unlink(missing_ok=True)
+        write_text(options.out / CONFIG_FILE, commented_yaml(settings))
+    result = None
     with (
-        output_folder(options.out),
-        interrupt_on_signals(lambda text: console.print_line(text, "yellow")) as request,
+        request.ending(),
+        ProgressBar(console, options.printing) as progress,
+        open_runner(options.jobs, options.scheduler) as runner,
     ):
-        if not options.resume:  # which takes its parameters from here
-            _refuse_to_replace(options)
-            (options.out / REPORT_FILE).unlink(missing_ok=True)
-            write_text(options.out / CONFIG_FILE, commented_yaml(settings))
-        try:
-            with (
-                ProgressBar(console, options.printing) as progress,
-                open_runner(options.jobs, options.scheduler) as runner,
-            ):
-                result = map_in_submaps(
-                    sequence,
-                    settings,
-                    submap_size,
-                    options.out / TASK_FOLDER,
-                    options.out / MAP_FOLDER,
-                    runner,
-                    rounds=options.rounds,
-                    resume=options.resume,
-                    skip_bad_frames=options.skip_bad_frames,
-                    progress=progress.advance,
-                )
-        except KeyboardInterrupt:
-            if request.aborted or not request():
-                raise
-            console.print_line("Stopped before the end; --resume continues from here.", "yellow")
-            return exit_status(request)
+        result = map_in_submaps(
+            sequence,
+            settings,
+            options.submap_size,
+            options.out / TASK_FOLDER,
+            options.out / MAP_FOLDER,
+            runner,
+            rounds=options.rounds,
+            resume=options.resume,
+            skip_bad_frames=options.skip_bad_frames,
+            progress=progress.advance,
+        )
+    if result is None:
+        console.print_line("Stopped before the end; --resume continues from here.", "yellow")
+    else:
         _print_result(console, options, result, _write(options, result))
-    return exit_status(request)
+    return request.exit_status
 
 
 def _refuse_to_replace(options: Map) -> None:

@@ -41,6 +41,11 @@ class StopRequest:
         return self.signal is not None
 
     @property
+    def exit_status(self) -> int:
+        """0, or what a shell expects of a program that was stopped by a signal."""
+        return 0 if self.signal is None else 128 + self.signal
+
+    @property
     def hurried(self) -> bool:
         """True if the run has to end within seconds (SIGTERM, SIGHUP)."""
         return self._hurried_at is not None
@@ -60,6 +65,15 @@ class StopRequest:
             yield
         finally:
             self._cuts_short = False
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """For a block in which this process waits for others: the first signal ends it, and no more."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            if self.aborted or not self():
+                raise
 
     def take(self, number: int) -> bool:
         """Note a signal; returns whether it changes anything. Raises KeyboardInterrupt if it aborts."""
