@@ -9,7 +9,7 @@ from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
 from taichi_mrf.session.pictures import view_images
 from taichi_mrf.session.run import Run
 from taichi_mrf.session.shown_extras import BaselineOverlay, ChangeList, ShownColors, ShownSurface
-from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Update, Watch
+from taichi_mrf.viewer.messages import Notice, Update, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
@@ -104,12 +104,7 @@ class Extras:
         """Look for what appeared and what left; False if it was nothing."""
         if self._changes is None:
             self._changes = ChangeList(self._run.mapper)
-        look = self._changes.look
-        found: list[SceneChanges] = []
-        self._run.guarded(lambda: found.extend(look()))
-        for changes in found:
-            self._run.send(changes)
-        return bool(found)
+        return self._send_found(self._changes.look)
 
     def _send_colors(self) -> bool:
         """Send the colours of voxels that have changed; False if there were none."""
@@ -117,11 +112,14 @@ class Extras:
             return False
         if self._colors is None:
             self._colors = ShownColors(self._run.mapper)
-        changes = self._colors.changes
-        found: list[BrickColors] = []
-        self._run.guarded(lambda: found.extend(changes()))
-        for colors in found:
-            self._run.send(colors)
+        return self._send_found(self._colors.changes)
+
+    def _send_found(self, find: Callable[[], Sequence[Update]]) -> bool:
+        """Send the updates that are found, if finding them raises nothing; False if there are none."""
+        found: list[Update] = []
+        self._run.guarded(lambda: found.extend(find()))
+        for update in found:
+            self._run.send(update)
         return bool(found)
 
     def _send_surface(self, go_on: GoOn) -> bool:

@@ -20,7 +20,7 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.submaps.job import Sequence as Recorded
+from taichi_mrf.submaps.plan import SourceFrames
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.system import runtime
 
@@ -130,7 +130,7 @@ def test_submaps_choose_keyframes_for_each_sensor_too(robot: Path) -> None:
     active = runtime.active()
     assert active is not None
     config = replace(config, runtime=replace(config.runtime, arch=active))
-    keyframes, _ = find_keyframes(Recorded(str(robot), {}), config, InTurn())  # type: ignore[arg-type]
+    keyframes, _ = find_keyframes(SourceFrames(str(robot), {}), config, InTurn())  # type: ignore[arg-type]
     assert [keyframe.index for keyframe in keyframes] == [0, 1]
 
 

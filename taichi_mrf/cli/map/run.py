@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 import taichi_mrf
 from taichi_mrf.cli.map.keep import refuse_changes
 from taichi_mrf.cli.map.sequence import Outcome, finished_before, map_in_process, map_to_folder
@@ -32,6 +30,7 @@ from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
 from taichi_mrf.cluster.choose import open_runner
@@ -229,12 +228,7 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
 
 def print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:
     """The report as a table, then what should be known besides, then where the files lie."""
-    table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for name, text in _report_rows(report):
-        table.add_row(name, text)
-    console.print(table)
+    print_facts(console, f"Map of {report['source']}", _report_rows(report))
     for note in report["notes"]:
         console.print_line(f"Note: {note}")
     for problem in report["skipped_frames"].values():

@@ -20,9 +20,6 @@ from taichi_mrf.errors import CutShortError
 INFER_SECONDS = 3.0
 """How long after SIGTERM a map may still be inferred: containers kill after 10 s, and it has to be saved."""
 
-_TELL_SECONDS = 0.2
-"""How long to wait until the user is told, so that this line comes before those that follow."""
-
 _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
