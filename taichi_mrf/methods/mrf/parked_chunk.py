@@ -18,8 +18,7 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.methods.map_file import read_places
-from taichi_mrf.methods.mrf.kept_rays import RayShare
-from taichi_mrf.methods.mrf.storage import (
+from taichi_mrf.methods.mrf.frozen_arrays import (
     color_arrays,
     dated_arrays,
     ray_arrays,
@@ -27,6 +26,7 @@ from taichi_mrf.methods.mrf.storage import (
     read_dated,
     read_rays,
 )
+from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.files import exists
 from taichi_mrf.system.npz_file import open_npz
