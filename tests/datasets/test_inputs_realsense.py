@@ -10,6 +10,7 @@ import pytest
 import tracked_room
 from datasets_recordings import stamped_line
 from realsense_motion import CLOCK, RATE, UP, MotionSensor
+from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -212,23 +213,17 @@ def test_an_image_that_does_not_come_again_is_a_broken_frame(
 
 
 def test_what_is_no_recording_is_named(library: type[Pipeline], tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"nowhere\.bag: no such file"):
-        open_dataset(f"realsense:{tmp_path}/nowhere.bag")
+    refused(f"realsense:{tmp_path}/nowhere.bag", "nowhere.bag: no such file")
     path = tmp_path / "other.bag"
     path.write_bytes(b"no bag")
-    with pytest.raises(DatasetError, match=r"other\.bag: cannot be played: Failed to resolve") as caught:
-        open_dataset(f"realsense:{path}")
-    assert "\n" not in str(caught.value)
-    with pytest.raises(DatasetError, match="unknown parameter 'pose'"):
-        open_dataset(f"realsense:{path}?pose=x")
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset(f"realsense:{path}", depth_scale=1000.0)
+    refused(f"realsense:{path}", "other.bag: cannot be played: Failed to resolve")
+    refused(f"realsense:{path}?pose=x", "unknown parameter 'pose'")
+    refused(f"realsense:{path}", "depth_scale", depth_scale=1000.0)
 
 
 def test_an_empty_recording_is_named(library: type[Pipeline], recording: Path) -> None:
     library.lost = tuple(range(COUNT))
-    with pytest.raises(DatasetError, match=r"walk\.bag: contains no depth images"):
-        open_dataset(f"realsense:{recording}")
+    refused(f"realsense:{recording}", "walk.bag: contains no depth images")
 
 
 @pytest.mark.parametrize(
@@ -288,8 +283,7 @@ def test_the_gyroscope_of_a_recording_is_read_whole(library: type[Pipeline], rec
 
 
 def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"nowhere\.txt"):
-        open_dataset(f"realsense:?poses={tmp_path}/nowhere.txt")
+    refused(f"realsense:?poses={tmp_path}/nowhere.txt", "nowhere.txt")
 
 
 @pytest.mark.usefixtures("one_backend")

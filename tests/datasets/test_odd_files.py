@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from datasets_recordings import Content, write_image, write_seven_scenes
 from inputs_bags import Bag, plain, writing
+from refusals import refused
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import StoragePlugin, storage_mcap
 from rosbags.rosbag2 import Writer as Writer2
@@ -93,8 +94,7 @@ def test_a_fifo_in_a_bag_is_refused(tmp_path: Path) -> None:
     file = next((tmp_path / "walk").glob("*.mcap"))
     file.unlink()
     os.mkfifo(file)
-    with pytest.raises(DatasetError, match=r"\.mcap: cannot be read: it is a FIFO"):
-        open_dataset(tmp_path / "walk")
+    refused(tmp_path / "walk", ".mcap: cannot be read: it is a FIFO")
 
 
 def png_of_zeros(width: int, height: int) -> bytes:

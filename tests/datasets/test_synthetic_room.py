@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
@@ -281,8 +282,7 @@ def test_wrong_options(query: str, problem: str) -> None:
 
 
 def test_a_depth_scale_has_no_meaning_here() -> None:
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset("synthetic:room", depth_scale=5000)
+    refused("synthetic:room", "depth_scale", depth_scale=5000)
 
 
 def test_rendering_before_taichi_runs_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:

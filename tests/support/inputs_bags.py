@@ -15,6 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -298,3 +299,13 @@ def plain(bag: Bag) -> None:
     images(bag)
     odometry(bag)
     mounted(bag)
+
+
+def check_poses(
+    dataset: Dataset, T_fixed: Pose | None = None, mount: Pose = T_body_camera, count: int = COUNT
+) -> None:
+    """Its frames are at the body's poses, seen from a fixed frame, and mounted so."""
+    assert len(dataset) == count
+    for i, frame in enumerate(dataset):
+        T = (np.eye(4) if T_fixed is None else T_fixed) @ world_body(i) @ mount
+        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)
