@@ -38,8 +38,6 @@ from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
-
-
 Write = Callable[[Bag], None]
 
 

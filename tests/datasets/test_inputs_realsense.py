@@ -2,14 +2,23 @@
 
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import tracked_room
 from datasets_recordings import stamped_line
-from realsense_motion import CLOCK, RATE, UP, MotionSensor
+from realsense_library import (
+    RATE,
+    STEPS,
+    UP,
+    MotionSensor,
+    depth_image,
+    installed,
+    profile_of,
+    sensors,
+)  # fmt: skip
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
@@ -21,8 +30,6 @@ from taichi_mrf.sensor.camera import PinholeCamera
 COUNT = 6
 FIRST = 1000.0
 """Seconds of the first image; they come at 10 Hz."""
-
-STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 
 
 def stamp(i: int) -> float:
@@ -54,13 +61,8 @@ class Pipeline:
         if not self.left:
             raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
         i = self.left.pop(0)
-        image = SimpleNamespace(
-            get_data=lambda: STEPS + 10 * i,
-            get_timestamp=lambda: 1000.0 * stamp(i),
-            get_frame_number=lambda: 100 + i,
-            get_frame_timestamp_domain=lambda: CLOCK,
-        )
-        return SimpleNamespace(get_depth_frame=lambda: image, number=i)
+        image, colors = depth_image(STEPS + 10 * i, stamp(i), 100 + i), np.full((3, 4, 3), 10 + i, np.uint8)
+        return SimpleNamespace(get_depth_frame=lambda: image, number=i, colors=colors)
 
     def stop(self) -> None:
         type(self).stopped += 1
@@ -83,28 +85,8 @@ class Config:
         return self.profile()
 
     def profile(self) -> SimpleNamespace:
-        intrinsics = SimpleNamespace(width=4, height=3, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
-        video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
-        sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
         player = SimpleNamespace(set_real_time=lambda on: setattr(self.playback, "real_time", on))
-        return SimpleNamespace(
-            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
-            get_device=lambda: SimpleNamespace(
-                first_depth_sensor=lambda: sensor, as_playback=lambda: player, query_sensors=lambda: []
-            ),
-        )
-
-
-class Align:
-    """Gives each image a colour of its own."""
-
-    def __init__(self, to: str) -> None:
-        assert to == "depth"
-
-    def process(self, frames: SimpleNamespace) -> SimpleNamespace:
-        image = np.full((*STEPS.shape, 3), 10 + frames.number, np.uint8)
-        color = SimpleNamespace(get_data=lambda: image)
-        return SimpleNamespace(get_depth_frame=frames.get_depth_frame, get_color_frame=lambda: color)
+        return profile_of(as_playback=lambda: player, query_sensors=lambda: [])
 
 
 class Context:
@@ -115,14 +97,13 @@ class Context:
 
     def load_device(self, file: str) -> SimpleNamespace:
         assert Path(file).is_file()
-        depth = SimpleNamespace(get_stream_profiles=lambda: [SimpleNamespace(stream_type=lambda: "depth")])
         motion = self.pipeline.motion
         return SimpleNamespace(
             set_real_time=lambda on: None if motion is None else setattr(motion, "real_time", on),
             set_status_changed_callback=lambda changed: (
                 None if motion is None else setattr(motion, "then", lambda: changed("stopped"))
             ),
-            query_sensors=lambda: [depth] if motion is None else [depth, motion],
+            query_sensors=lambda: sensors(motion),
         )
 
 
@@ -133,15 +114,14 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
     class TestPipeline(Pipeline):
         pass
 
-    module = ModuleType("pyrealsense2")
-    names = {"pipeline": TestPipeline, "config": Config, "pipeline_wrapper": lambda pipeline: pipeline}
-    names |= {"stream": SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel")}
-    names |= {"align": Align, "context": lambda: Context(TestPipeline)}
-    names |= {"playback_status": SimpleNamespace(stopped="stopped")}
-    names |= {"format": SimpleNamespace(z16="z16", rgb8="rgb8")}
-    for name, value in names.items():
-        setattr(module, name, value)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+    installed(
+        monkeypatch,
+        pipeline=TestPipeline,
+        config=Config,
+        pipeline_wrapper=lambda pipeline: pipeline,
+        context=lambda: Context(TestPipeline),
+        playback_status=SimpleNamespace(stopped="stopped"),
+    )
     return TestPipeline
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from point_clouds import Walk, las_head, lzf, write_pcd, write_ply
+from point_clouds import LasFile, Walk, las_head, lzf, write_pcd, write_ply
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.clouds import is_cloud, natural, read_cloud
@@ -193,24 +193,9 @@ def test_an_npz_without_points_is_refused(
         read_cloud(tmp_path / "a.npz")
 
 
-class LasFile:
-    """A stand-in for an open file of laspy's, and for its points."""
-
-    xyz = POINTS
-
-    def __enter__(self) -> "LasFile":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def read(self) -> "LasFile":
-        return self
-
-
 @pytest.fixture
 def laspy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda stream, closefd: LasFile()))
+    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda stream, closefd: LasFile(POINTS)))
 
 
 @pytest.mark.usefixtures("laspy")

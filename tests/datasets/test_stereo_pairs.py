@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import Content, row_of, write_image, write_rows, write_seven_scenes
-from kitti_street import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_kitti
 from numpy.typing import NDArray
 from refusals import refused
+from stereo_rig import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_kitti
 
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset

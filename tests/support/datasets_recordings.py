@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -60,12 +61,8 @@ def row_of(matrix: NDArray[np.float64]) -> str:
 
 
 def quaternion_of(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x y z w of a rotation, from its axis (the eigenvector to the eigenvalue 1) and angle."""
-    values, vectors = np.linalg.eig(R)
-    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
-    antisymmetric = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle = np.arctan2(antisymmetric @ axis / 2, (np.trace(R) - 1) / 2)
-    return np.array([*(np.sin(angle / 2) * axis), np.cos(angle / 2)])
+    """x y z w of a rotation."""
+    return Rotation.from_matrix(R).as_quat()
 
 
 def stamped_line(stamp: float, pose: Pose) -> str:
@@ -126,8 +123,6 @@ def write_log(path: Path, poses: list[Pose], first: int = 0) -> Path:
 
 
 CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
-
-
 K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
 
 

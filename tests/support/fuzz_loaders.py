@@ -36,7 +36,6 @@ from datasets_recordings import (
     write_tum,
 )
 from inputs_bags import Bag, Kind, plain, writing
-from kitti_street import write_kitti
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
 from point_clouds import Walk, write_pcd, write_velodyne
@@ -47,6 +46,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rtabmap_database import Database, calibration, encoded, rvl
 from stereo_rig import write as write_stereo_file
+from stereo_rig import write_kitti
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.truth_sources import read_stamps

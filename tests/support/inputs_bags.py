@@ -251,17 +251,9 @@ def writing(path: Path, kind: Kind) -> Iterator[Bag]:
 
 
 CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
-
-
 COUNT = 5
-
-
 FRAME = "camera_depth_optical_frame"
-
-
 BODY = "base_link"
-
-
 T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
 
 
