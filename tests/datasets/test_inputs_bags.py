@@ -1,7 +1,6 @@
 """Bags of all three kinds, read back; what is chosen in them, what is left out, and what is said of bad
 ones."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -519,14 +518,6 @@ def test_messages_of_one_moment_are_kept_apart(make: Callable[..., Path]) -> Non
             np.testing.assert_array_equal(
                 dataset.read(i).depth_m, steps(i).astype(np.float32) / np.float32(1000)
             )
-
-
-def test_without_its_library_one_line_says_what_to_install(
-    make: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = make(plain)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    refused(path, "pip install 'taichi-mrf[ros]'")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,6 +12,7 @@ from datasets_recordings import (
     Content,
     K,
     arrays,
+    check_frames,
     column_by_column,
     row_of,
     text_of,
@@ -24,7 +25,7 @@ from datasets_recordings import (
 )
 from refusals import refused
 
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -36,21 +37,10 @@ def content() -> Content:
     return Content()
 
 
-def assert_same(dataset: Dataset, content: Content, steps: float, colored: bool = False) -> None:
-    assert len(dataset) == content.count
-    assert dataset.camera == CAMERA
-    for i, frame in enumerate(dataset):
-        np.testing.assert_allclose(frame.depth_m, content.depth[i] / np.float32(steps), rtol=1e-6)
-        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
-        assert (frame.color is not None) == colored
-        if frame.color is not None:
-            np.testing.assert_array_equal(frame.color, content.color[i])
-
-
 def test_scannet(tmp_path: Path, content: Content) -> None:
     folder = write_scannet(tmp_path / "scene0000_00", content)
     dataset = open_dataset(folder)
-    assert_same(dataset, content, 1000.0)
+    check_frames(dataset, content, 1000.0)
     assert list(dataset.frame_names) == ["0", "5", "10", "15", "20"]
     assert dataset.notes == []
 
@@ -125,7 +115,7 @@ def test_replica(tmp_path: Path, content: Content, place: str) -> None:
     folder = tmp_path / "room0"
     folder.mkdir()
     dataset = open_dataset(write_replica(folder, content, folder / place / "cam_params.json"))
-    assert_same(dataset, content, 6553.5, colored=True)
+    check_frames(dataset, content, 6553.5, colored=True)
     assert dataset.notes == []
 
 
@@ -149,7 +139,7 @@ def test_open3d_with_a_log(tmp_path: Path, content: Content) -> None:
     (folder / "camera.txt").unlink()
     (folder / "camera_intrinsic.json").write_text(json.dumps(INTRINSIC))
     write_log(folder / "trajectory.log", content.poses)
-    assert_same(open_dataset(folder), content, 1000.0, colored=True)
+    check_frames(open_dataset(folder), content, 1000.0, colored=True)
 
 
 @pytest.mark.parametrize("kind", ["PinholeCameraTrajectory", "PoseGraph"])
@@ -163,7 +153,7 @@ def test_open3d_with_a_json(tmp_path: Path, content: Content, kind: str) -> None
         values = {"parameters": [{"extrinsic": e, "intrinsic": INTRINSIC} for e in extrinsics]}
     (folder / "trajectory.json").write_text(json.dumps({"class_name": kind, **values}))
     dataset = open_dataset(folder)
-    assert_same(dataset, content, 1000.0, colored=True)
+    check_frames(dataset, content, 1000.0, colored=True)
     (note,) = dataset.notes
     assert note.startswith("depth: 1000 steps per metre (assumed as Redwood has it)")
 
@@ -198,7 +188,7 @@ def test_open3d_files_that_make_no_sense(
 def test_npz(tmp_path: Path, content: Content) -> None:
     path = write_npz(tmp_path / "walk.npz", arrays(content))
     dataset = open_dataset(path)
-    assert_same(dataset, content, 1000.0, colored=True)
+    check_frames(dataset, content, 1000.0, colored=True)
     assert [frame.stamp for frame in dataset] == [0.0, 0.5, 1.0, 1.5, 2.0]
     assert list(dataset.frame_names) == [f"walk-{i:06d}" for i in range(5)]
     assert open_dataset(path, color=False).read(0).color is None
@@ -212,9 +202,9 @@ def test_npz_of_steps_and_numbers(tmp_path: Path, content: Content) -> None:
     values |= {name: np.array(getattr(CAMERA, name)) for name in ("fx", "fy", "cx", "cy")}
     path = write_npz(tmp_path / "walk.npz", values)
     refused(path, "needs depth_scale")
-    assert_same(open_dataset(path, depth_scale=2000.0), content, 2000.0)
+    check_frames(open_dataset(path, depth_scale=2000.0), content, 2000.0)
     scaled = write_npz(tmp_path / "scaled.npz", {**values, "depth_scale": np.array(4000.0)})
-    assert_same(open_dataset(scaled), content, 4000.0)
+    check_frames(open_dataset(scaled), content, 4000.0)
 
 
 def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> None:
@@ -226,7 +216,7 @@ def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> No
         write_npz(tmp_path / f"b{i}.npz", {"K": K, **one})
     dataset = open_dataset(tmp_path)
     assert list(dataset.frame_names) == ["a-000000", "a-000001", "b2", "b3", "b4"]
-    assert_same(dataset, content, 1000.0, colored=True)
+    check_frames(dataset, content, 1000.0, colored=True)
     write_npz(tmp_path / "c.npz", {**both, "K": np.diag([1.2, 1.2, 1]) @ K})
     other = open_dataset(tmp_path).read(5).camera
     assert (other.fx, other.cy) == pytest.approx((1.2 * CAMERA.fx, 1.2 * CAMERA.cy))

@@ -244,13 +244,6 @@ def test_a_panic_of_the_unpacker_is_an_error(tmp_path: Path, monkeypatch: pytest
         read_cloud(tmp_path / "a.las")
 
 
-def test_las_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    (tmp_path / "a.las").write_bytes(b"LASF")
-    with pytest.raises(DatasetError, match=r"need laspy, .*: pip install 'taichi-mrf\[las\]'"):
-        read_cloud(tmp_path / "a.las")
-
-
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las_as_laspy_writes_it(tmp_path: Path, suffix: str) -> None:
     laspy = pytest.importorskip("laspy", reason="LAS files need laspy")

@@ -1,6 +1,5 @@
 """A RealSense camera, played by a stand-in for its library; and what is said where that is not installed."""
 
-import sys
 from types import SimpleNamespace
 
 import cv2
@@ -73,11 +72,6 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
 
     installed(monkeypatch, pipeline=TestPipeline, config=Config)
     return TestPipeline
-
-
-def test_without_its_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    refused("realsense:", "pip install 'taichi-mrf[realsense]'")
 
 
 def test_images_come_in_metres_with_the_cameras_own_intrinsics(library: type[Pipeline]) -> None:

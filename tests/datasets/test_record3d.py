@@ -1,7 +1,6 @@
 """Record3D's recordings: depth, poses, cameras, colours, and confidence as a sigma for each pixel."""
 
 import struct
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -30,11 +29,6 @@ def packer() -> Callable[[bytes], bytes]:
 @pytest.fixture(params=["walk.r3d", "walk"])
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return write_record3d(tmp_path / request.param, CONTENT)
-
-
-def stored(data: bytes) -> bytes:
-    """An LZFSE stream of one block that is not packed."""
-    return b"bvx-" + struct.pack("<I", len(data)) + data + b"bvx$"
 
 
 def check_frames(path: Path) -> None:
@@ -236,10 +230,3 @@ def test_packed_blocks_tell_what_they_hold() -> None:
         assert unpacked(packed, len(content)) == content
         with pytest.raises(DatasetError, match=r"cut short|damaged"):
             unpacked(packed[:-4], len(content))
-
-
-def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_record3d(tmp_path / "walk.r3d", CONTENT, stored)
-    monkeypatch.setitem(sys.modules, "lzfse", None)
-    with pytest.raises(DatasetError, match=r"needs lzfse, .*: pip install 'taichi-mrf\[record3d\]'"):
-        open_dataset(path)

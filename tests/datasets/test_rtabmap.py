@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from datasets_recordings import CAMERA
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from refusals import refused
@@ -21,7 +22,6 @@ from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 RANDOM = np.random.default_rng(5)
 DEPTH = [RANDOM.integers(400, 9000, CAMERA.shape).astype(np.uint16) for _ in range(4)]
 COLOR = RANDOM.integers(1, 256, (*CAMERA.shape, 3)).astype(np.uint8)

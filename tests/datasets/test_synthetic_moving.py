@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.analytic_scene import Solid, distance_to
@@ -151,4 +150,3 @@ def test_a_room_without_motion_is_the_furnished_room() -> None:
     assert room.moving_scene is None
     assert room.scene_at(3) is room.scene
     assert room.stamp_at(5) == 1.0
-    refused("synthetic:room?moving=cat", "moving must be one of none, things, door, walker")

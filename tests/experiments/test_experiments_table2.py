@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.polynomial.polynomial import polyval
-from small_scenes import HOUSE_VIEWS, KITCHEN_VIEWS, experiment, make_data
+from small_scenes import HOUSE_VIEWS, KITCHEN_VIEWS, experiment
 
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -39,11 +39,6 @@ OCCUPANCY = [
     "precision", "recall", "ROC area", "Brier score", "expected calibration error", "occupied",
     "judged voxels",
 ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -122,7 +123,6 @@ def write_log(path: Path, poses: list[Pose], first: int = 0) -> Path:
     return path
 
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
 
 
@@ -259,3 +259,21 @@ FORMATS = {  # writer, steps per metre, whether colour is written
     "icl": (write_icl, 5000.0, False),
     "house": (write_house, 5000.0, False),
 }
+
+
+def check_frames(
+    dataset: Dataset, content: Content, steps: float, colored: bool = False, camera: PinholeCamera = CAMERA
+) -> None:
+    """The frames are those of the content, and of the camera."""
+    assert dataset.camera == camera
+    assert len(dataset) == len(dataset.frame_names) == content.count
+    for i, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.depth_m, content.depth[i] / np.float32(steps), rtol=1e-6)
+        assert frame.depth_m.dtype == np.float32
+        assert frame.depth_m[0, 0] == 0
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        assert (frame.camera, frame.name) == (camera, dataset.frame_names[i])
+        if colored:
+            np.testing.assert_array_equal(frame.color, content.color[i])
+        else:
+            assert frame.color is None

@@ -1,14 +1,14 @@
 """Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from datasets_recordings import quaternion_of
+from datasets_recordings import CAMERA, quaternion_of
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -250,7 +250,18 @@ def writing(path: Path, kind: Kind) -> Iterator[Bag]:
         yield Bag(kind, writer)
 
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+def write_bag(folder: Path, *parts: Callable[[Bag], object], kind: Kind = "ros1", name: str = "walk") -> Path:
+    """A bag of parts; returns its path. A second one of the same name has a number behind it."""
+    suffix = ".bag" if kind == "ros1" else ""
+    path = folder / (name + suffix)
+    if path.exists():
+        path = folder / f"{name}{len(list(folder.iterdir()))}{suffix}"
+    with writing(path, kind) as bag:
+        for part in parts:
+            part(bag)
+    return path
+
+
 COUNT = 5
 FRAME = "camera_depth_optical_frame"
 BODY = "base_link"
