@@ -147,7 +147,11 @@ def test_table2_goes_on_where_it_was(second: tuple, data: Path) -> None:
     assert lines == run.ledger.path.read_text().splitlines(keepends=True)
 
 
-def test_table2_without_held_out_views(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table2_without_held_out_views_and_a_ray_caster(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("embreex", "embreex.rtcore_scene", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.setattr(table2, "THRESHOLD", 0.1)
     run = experiment(data, tmp_path, voxel_sizes=(0.2,), limit=2)
     tables, _ = run_table2(run)
@@ -160,14 +164,6 @@ def test_table2_says_what_reads_meshes(data: Path, tmp_path: Path, monkeypatch: 
     with pytest.raises(DatasetError, match=r"trimesh.*pip install 'taichi-mrf\[mesh\]'") as caught:
         run_table2(experiment(data, tmp_path, voxel_sizes=(0.2,)))
     assert "\n" not in str(caught.value)
-
-
-def test_table2_needs_no_ray_caster(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("embreex", "embreex.rtcore_scene", "embreex.mesh_construction"):
-        monkeypatch.setitem(sys.modules, module, None)
-    run = experiment(data, tmp_path, voxel_sizes=(0.2,), limit=2)
-    tables, _ = run_table2(run)
-    assert row_of(tables[0], "MRFMap")["views"] == 2
 
 
 def test_table2_names_a_missing_mesh(data: Path, tmp_path: Path) -> None:
