@@ -20,8 +20,7 @@ from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.inference.ray_model import Limits
-from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
-from taichi_mrf.submaps.plan import plan_submaps
+from taichi_mrf.submaps.plan import PLAN_FILE, Job, SourceFrames, plan_submaps
 from taichi_mrf.submaps.round_files import (
     SubmapReport,
     read_core,
@@ -65,7 +64,7 @@ class SubmapsResult:
 
 
 def map_in_submaps(
-    sequence: Sequence,
+    sequence: SourceFrames,
     config: Config,
     submap_size: float,
     folder: Path,
@@ -127,7 +126,7 @@ def _check(config: Config, rounds: int) -> None:
 
 
 def _job(
-    sequence: Sequence,
+    sequence: SourceFrames,
     config: Config,
     submap_size: float,
     folder: Path,

@@ -14,8 +14,8 @@ import numpy as np
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.queries.points import probability
-from taichi_mrf.submaps.job import Job
 from taichi_mrf.submaps.partial_map import PartialMap
+from taichi_mrf.submaps.plan import Job
 from taichi_mrf.submaps.round_files import (
     Bricks,
     Halo,
