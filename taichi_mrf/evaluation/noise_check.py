@@ -2,14 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.accuracy import JudgedMap
 from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, explained, pooled, sigma_factor, sigma_law
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.noise import NoiseModel, unwidened_noise
+from taichi_mrf.sensor.noise import unwidened_noise
 
 MOST_FRAMES = 8
 """Held-out frames that are looked at, evenly spread: a factor needs no more."""
@@ -21,13 +20,6 @@ other frames, by more than the second,"""
 LEAST_GAIN = 0.02
 """if measurements are likelier by so many nats each with the right one. Where voxels are much larger than
 sigma, no factor on it makes a difference. Right noises came out at up to .004, the kitchen's at .05."""
-
-
-class NoisyMap(JudgedMap, Protocol):
-    """A map that knows its noise."""
-
-    @property
-    def noise(self) -> NoiseModel: ...
 
 
 @dataclass(frozen=True)
@@ -49,7 +41,7 @@ class NoiseCheck:
 
 
 def check_noise(
-    m: NoisyMap,
+    m: VoxelMap,
     dataset: Dataset,
     held_out: Sequence[int],
     on_frame: Callable[[], None] = lambda: None,
@@ -87,7 +79,7 @@ def checked(measured: Explained, frames: int, most: float = DOUBTED) -> NoiseChe
     return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by) if wrong else None)
 
 
-def explained_frame(m: NoisyMap, frame: Frame) -> Explained | None:
+def explained_frame(m: VoxelMap, frame: Frame) -> Explained | None:
     """How well a map explains a frame that it has not seen, by the noise that both state."""
     noise = frame.own_for(m.sensor).noise_model(m.noise, frame.depth_m)
     plain = replace(m.sensor, sigma_scale=1.0, sigma_added=0.0)

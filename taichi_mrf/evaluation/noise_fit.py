@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.evaluation.accuracy import JudgedMap, judge_view
+from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
@@ -82,7 +83,7 @@ class Explained:
 
 
 def explained(
-    m: JudgedMap,
+    m: VoxelMap,
     depth_m: NDArray[np.float32],
     T_world_camera: ArrayLike,
     camera: Camera,

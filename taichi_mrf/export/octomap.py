@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.export.octree import Nodes, channels, octree_of
-from taichi_mrf.queries.colored import ColoredMap
-from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path
 
 FULL_HEADER, BINARY_HEADER = "# Octomap OcTree file", "# Octomap OcTree binary file"
@@ -25,7 +24,7 @@ COLOR_NODE = np.dtype([("value", "<f4"), ("color", "u1", 3), ("children", "u1")]
 """A node of an ``.ot`` of the kind ColorOcTree."""
 
 
-def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None, cells: bool = False) -> None:
+def write_ot(path: str | Path, m: VoxelMap, colored: VoxelMap | None = None, cells: bool = False) -> None:
     """Write a map with its log-odds, as a ColorOcTree with the colours of ``colored``, the same map; unknown
     stays unknown. With ``cells``, larger leaves stand in for voxels none of which is likely occupied
     (octree.octree_of). Raises MapFileError, CapacityError."""
@@ -38,7 +37,7 @@ def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None,
     _write(path, FULL_HEADER, nodes, m.voxel_size, records.tobytes(), kind)
 
 
-def write_bt(path: str | Path, m: QueriedMap, cells: bool = False) -> None:
+def write_bt(path: str | Path, m: VoxelMap, cells: bool = False) -> None:
     """Write which voxels are free and which occupied, the rest being unknown; ``cells`` as in
     :func:`write_ot`. Raises MapFileError, CapacityError."""
     nodes = octree_of(m, only_state=True, cells=cells)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.queries.cells import SUREST, standing_in
-from taichi_mrf.queries.colored import ColoredMap
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
@@ -85,7 +85,7 @@ class Nodes:
 
 
 def octree_of(
-    m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = None, cells: bool = False
+    m: VoxelMap, *, only_state: bool, colored: VoxelMap | None = None, cells: bool = False
 ) -> Nodes:
     """The known space of a map in pre-order: no node for unknown space, leaves for free space, with or
     without voxels in the map, and for what is occupied. Eight equal leaves are one.

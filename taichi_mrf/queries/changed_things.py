@@ -11,8 +11,8 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.change import MapChange
 from taichi_mrf.queries.clear_of_surfaces import CORE_VOXELS, Surfaces, stands_clear
 from taichi_mrf.queries.clusters import find_clusters
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.queries.voxel_map import VoxelMap
 
 Verb = Literal["appeared", "left"]
 
@@ -38,7 +38,7 @@ class ChangedThing:
         return 0.5 * (self.lower_m + self.upper_m)
 
 
-def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = CORE_VOXELS) -> MapChange:
+def without_slack(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_VOXELS) -> MapChange:
     """Voxels that appeared or left from map a to map b, without what can be a surface of the other map that
     has shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
     voxels = np.floor(change.points / a.voxel_size).astype(np.int32)

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, seen_free_bricks
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
 from taichi_mrf.voxels.window import Window
@@ -20,7 +21,7 @@ from taichi_mrf.voxels.window import Window
 class RaySpace:
     """A map's known and unknown space. It is good for as long as the map does not change."""
 
-    def __init__(self, m: QueriedMap) -> None:
+    def __init__(self, m: VoxelMap) -> None:
         self.map = m
         self._reader = BrickReader(m)
         self._free = seen_free_bricks(m)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import Z_UP, plan_axes
 from taichi_mrf.queries.box import FARTHEST_VOXEL, map_extent, voxel_box, voxels_of_box
-from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.voxel_map import VoxelMap
 
 Axis = Literal["x", "y", "z"]
 
@@ -33,7 +33,7 @@ class MapSlice:
 
 
 def slice_map(
-    m: QueriedMap,
+    m: VoxelMap,
     at: float,
     axis: Literal["up"] | Axis = "up",
     lower: ArrayLike | None = None,

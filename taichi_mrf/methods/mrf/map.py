@@ -18,7 +18,6 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
@@ -259,20 +258,7 @@ class MRFMap(BrickMap):
         A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. Of bricks that
         are not allocated yet, only that it saw them to be free is kept.
         """
-        parts, keyframe = self._parts, self._parts.find(id)
-        inferring.restore_messages(parts)
-        if keyframe.messages is None:
-            raise KeyframeError(
-                f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
-            )
-        parts.colors.freeze(keyframe)
-        surfacing.keep_rays(parts, keyframe)
-        parts.allocator.freeze(keyframe)
-        parts.surfels.freeze(keyframe)
-        parts.decisions.frozen(id)
-        parts.frozen[id] = keyframe.name
-        del self._keyframes[id]
-        parts.settled = False
+        inferring.freeze_keyframe(self._parts, id)
 
     def infer(
         self,
