@@ -18,9 +18,9 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import in_seconds
+from taichi_mrf.datasets.pose_text import stamps_a_second
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.timed_poses import apart_in_words
+from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import RecordedPose, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -58,6 +58,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         for (stamp, path), partner in zip(depth, partners, strict=True)
         if partner is not None
     ]
+    if 2 * len(matched) < len(depth):
+        check_unit(stamps, [pose.key for pose in known], "depth images", str(folder), poses.name)
     if not matched:
         first, last = trajectory.poses[0].key, trajectory.poses[-1].key
         raise DatasetError(
@@ -171,10 +173,11 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         longest = max((len(os.fsencode(part)) for part in file.parts), default=0)
         if longest > LONGEST_NAME:
             raise DatasetError(f"{path} line {number}: no file has a name of {longest} bytes")
-        entries.append((in_seconds(stamp), file))
+        entries.append((stamp, file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")
-    return sorted(entries)
+    rate = stamps_a_second([stamp for stamp, _ in entries])
+    return sorted((stamp / rate, file) for stamp, file in entries)
 
 
 def _beside(folder: Path, name: str) -> Path:

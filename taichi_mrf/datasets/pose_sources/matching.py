@@ -59,6 +59,11 @@ class FramePoses:
         return len(self._poses) + len(self._timed)
 
     @property
+    def stamps(self) -> NDArray[np.float64]:
+        """The stamps of the poses that have some, seconds."""
+        return self._timed.stamps
+
+    @property
     def warning(self) -> str | None:
         """Warning of poses that belong to no frame."""
         if not self.unknown:
