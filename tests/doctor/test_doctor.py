@@ -129,14 +129,31 @@ def test_a_camera_that_turns_in_place_does_not_tell_the_unit(room: list[Frame]) 
     assert {"the unit of depth", "the direction of poses", "the time of poses"} <= set(still.undecided)
 
 
+def in_millimetres(frames: Sequence[Frame]) -> list[Frame]:
+    return of_poses(lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [np.eye(4)[3:]]]))(frames)
+
+
 def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
     same = [replace(frame, T_world_camera=room[0].T_world_camera) for frame in room]
     (finding,) = diagnose(of_frames(same)).findings
     assert "all the same" in finding.text
     assert "--poses FILE" in finding.text
-    in_mm = of_poses(lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [np.eye(4)[3:]]]))(room)
-    (finding,) = diagnose(of_frames(in_mm)).findings
+    (finding,) = diagnose(of_frames(in_millimetres(room))).findings
     assert finding.text == "poses are in millimetres: divide their positions by 1000"
+    both = [replace(f, depth_m=np.rint(1000 * f.depth_m) / np.float32(5000)) for f in in_millimetres(room)]
+    (finding,) = diagnose(of_frames(both)).findings
+    assert finding.text.startswith("poses and depths are in one unit, and that is not metres")
+    assert finding.flag == "--depth-scale 1000"
+
+
+def test_a_sensor_that_moves_farther_than_it_sees_is_a_note(room: list[Frame], tmp_path: Path) -> None:
+    """Also where frames are too few for a reading that explains them."""
+    for name, frames in (("right", room), ("wrong", in_millimetres(room))):
+        folder = write_tum(tmp_path / name, frames[::8])
+        notes = " ".join(open_dataset(folder, depth_scale=1000).notes)
+        assert ("farther than it sees" in notes and "such as millimetres" in notes) == (name == "wrong")
+        found = diagnose(open_dataset(folder, depth_scale=1000)).findings
+        assert any("millimetres" in finding.text for finding in found) == (name == "wrong")
 
 
 def test_a_short_recording_of_quick_turns_is_understood(room: list[Frame]) -> None:
