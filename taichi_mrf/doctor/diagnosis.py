@@ -10,6 +10,7 @@ from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
 from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
+from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.doctor.readings import POSE_UNITS, UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
@@ -67,6 +68,12 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     if isinstance(dataset, Mended):
         said = said if dataset.conventions == AS_USUAL else dataset.conventions
         dataset = dataset.source
+    elif isinstance(dataset, PosedFrames) and dataset.poses.conventions != AS_USUAL:
+        inner = dataset.source
+        said = dataset.poses.conventions
+        if isinstance(inner, Mended):
+            said, inner = replace(said, along_ray=inner.conventions.along_ray), inner.source
+        dataset = replace(dataset, source=inner, poses=dataset.poses.as_written(inner.frame_names))
     given = Reading(**asdict(said))
     source: Dataset = dataset
     while isinstance(source, Derived):

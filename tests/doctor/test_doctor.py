@@ -16,9 +16,10 @@ from kitti_street import write_kitti
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes_at_a_glance
+from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes, mistakes_at_a_glance
 from taichi_mrf.doctor.picture import overlap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
@@ -242,6 +243,18 @@ def test_map_names_the_mistake_and_learns_no_noise_from_it(
     assert note.endswith("poses are T_camera_world (--poses-are inverse mends it).")
     assert report["noise"]["learnt"] is None
     assert "--noise auto" not in " ".join(report["notes"])
+
+
+@pytest.mark.parametrize(("wrong", "depth_is"), [("inverse,opengl", "axial"), ("ros", "range")])
+def test_map_says_the_words_of_a_pose_file_as_they_ought_to_be_written(
+    room: list[Frame], wrong: str, depth_is: str, tmp_path: Path
+) -> None:
+    frames = broken(room, "opengl", *(["range"] if depth_is == "range" else []))
+    folder, lines = write_tum(tmp_path / "mine", frames), tmp_path / "poses.txt"
+    lines.write_text((folder / "groundtruth.txt").read_text())
+    said = {"depth_scale": 1000, "depth_is": depth_is, "color": False}
+    (mistake,) = mistakes(open_posed(folder, lines, poses_are=wrong, **said))
+    assert mistake.endswith("(--poses-are opengl mends it)")
 
 
 def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp_path: Path) -> None:
