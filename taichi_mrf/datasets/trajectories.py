@@ -13,6 +13,7 @@ can still be used.
 
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.pose_text import Line, lines_of_numbers, numbers_in, split, stamps_a_second
 from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -29,6 +31,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
+
+OTHERWISE = "--poses FILE takes them from elsewhere, --track-poses finds them"
+"""Remedy for a recording without poses."""
 
 _UNIT_LENGTH = 0.01
 """Seven numbers are a pose if the last four are of length 1, up to so much."""
@@ -123,6 +128,12 @@ def _longest_run(path: Path, poses: tuple[RecordedPose, ...]) -> tuple[RecordedP
         stacklevel=2,
     )
     return longest
+
+
+def poses_at_start(folder: Path, layout: Layout, keys: Iterable[float]) -> Trajectory:
+    """Poses for frames that have none: they are found while mapping, or taken from elsewhere."""
+    start = start_pose()[:3]
+    return Trajectory(folder, layout, tuple(RecordedPose(key, start, str(folder)) for key in keys))
 
 
 def valid_poses(trajectory: Trajectory) -> tuple[list[float], list[Pose]]:
