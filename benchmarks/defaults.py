@@ -31,7 +31,7 @@ from taichi_mrf.experiments.scenes import (
     lidar_scene,
 )
 from taichi_mrf.experiments.stereo.street import street_scene
-from taichi_mrf.queries.measured_depth import Answer
+from taichi_mrf.queries.view import Answer
 
 STRIDE = 3
 """Every so many-th row and column is judged."""

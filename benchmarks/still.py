@@ -16,9 +16,9 @@ import tyro
 from taichi_mrf.cli.options.config_file import live_defaults
 from taichi_mrf.config.schema import Config
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.session import change_list
-from taichi_mrf.session.run import Policy
+from taichi_mrf.session import shown_extras
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import open_source
 from taichi_mrf.viewer.messages import KeyframeInfo, Request, SceneChanges, Update
 
@@ -80,7 +80,7 @@ def dynamic_share(m: MRFMap) -> float:
 def main() -> None:
     """Print both."""
     options = tyro.cli(Options, description=__doc__)
-    change_list.SHARE_OF_TIME = math.inf
+    shown_extras.SHARE_OF_TIME = math.inf
     source, _ = open_source(
         options.source, options.settings, every=options.every, limit=options.limit, speed=0.0, loop=False
     )

@@ -10,7 +10,7 @@ from fuzz_case import run_case
 from fuzz_loaders import LOADERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from inputs_bags import plain, writing
+from inputs_bags import plain, write_bag
 
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.errors import DatasetError
@@ -45,9 +45,7 @@ def test_what_once_went_wrong_is_refused(name: str, seed: int, root: Path) -> No
 
 
 def test_an_index_that_points_to_another_topics_message_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "walk.bag"
-    with writing(path, "ros1") as bag:
-        plain(bag)
+    path = write_bag(tmp_path, plain)
     opening = b"op=\x04\x08\x00\x00\x00ver=\x01\x00\x00\x00\t\x00\x00\x00conn="
     first, second = (opening + bytes((topic, 0, 0, 0)) for topic in range(2))
     content = path.read_bytes()

@@ -5,7 +5,7 @@ import sys
 import tyro
 
 from taichi_mrf.cli.eval import run_eval
-from taichi_mrf.cli.options.eval import Eval
+from taichi_mrf.cli.options.measure import Eval
 from taichi_mrf.experiments.run import Entry
 
 EXPERIMENTS = {

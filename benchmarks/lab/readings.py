@@ -162,7 +162,7 @@ def _solid(m: MRFMap, shown: MRFMap | MapReading) -> View:
     pool = shown.view.pool
     solid = ti.ndarray(ti.f32, pool.belief.shape)
     solid.from_numpy(np.where(pool.belief.to_numpy() > 0, OCCUPIED, -OCCUPIED).astype(np.float32))
-    return MapReading(m, solid).view.with_occlusion(empty_below=0.0)
+    return MapReading(m, m._parts, solid).view.with_occlusion(empty_below=0.0)
 
 
 def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View | None) -> list[float]:

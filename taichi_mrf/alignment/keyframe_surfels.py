@@ -1,15 +1,21 @@
 """The surface that all keyframes of one map have measured, kept up to date as they come, move and go."""
 
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.surfels import Surfels, merged, surfels_of
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import CHUNK_VOXELS, grid_keys
+
+if TYPE_CHECKING:
+    from taichi_mrf.alignment import oriented_points
+else:
+    (oriented_points,) = later("taichi_mrf.alignment", "oriented_points")
 
 
 class KeyframeSurfels:
@@ -84,6 +90,6 @@ class KeyframeSurfels:
     def _measure(self, keyframe: Keyframe) -> None:
         known, T_world_camera = self._kept.get(keyframe.id), keyframe.T_world_camera
         if known is None or known[0] is not T_world_camera:
-            points = oriented_points(keyframe.image, self.max_depth)
+            points = oriented_points.oriented_points(keyframe.image, self.max_depth)
             self._kept[keyframe.id] = (T_world_camera, surfels_of(points, T_world_camera, self.cell_size))
             self.revision += 1

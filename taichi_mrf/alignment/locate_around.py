@@ -66,7 +66,7 @@ FINER, FINEST = 8, 3
 
 
 @dataclass(frozen=True)
-class Place:
+class FoundPose:
     """End of an alignment, the share of the map that the scan looks ``through`` from there, and what the
     place is ``worth``, at most 1."""
 
@@ -91,12 +91,12 @@ def found_around(
     lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
     free = replace(config, translation_sigma=FREE_M, rotation_sigma=FREE_RAD)
 
-    def aligned_at(level: int, poses: Sequence[Pose]) -> list[Place]:
+    def aligned_at(level: int, poses: Sequence[Pose]) -> list[FoundPose]:
         places = []
         for T in poses:
             end = align(levels[level], T, Recorded(T, free), lever_m, observable)
             through = sight.seen_through(planes, end.T_world_camera) if level > 0 else 0.0
-            places.append(Place(end, through, worth(end, around) - through))
+            places.append(FoundPose(end, through, worth(end, around) - through))
         return places
 
     places = aligned_at(0, candidates(points, surface.planes(), around))
@@ -130,9 +130,9 @@ def worth(end: Aligned, around: Around) -> float:
     return end.equations.fit + (1.0 - UNMAPPED) * unmapped - SURPRISE * float(away) ** 2
 
 
-def distinct(places: Sequence[Place], apart_m: float) -> list[Place]:
+def distinct(places: Sequence[FoundPose], apart_m: float) -> list[FoundPose]:
     """The best first, without those that are within ``apart_m`` metres of a better one and turned like it."""
-    found: list[Place] = []
+    found: list[FoundPose] = []
     for place in sorted(places, key=lambda place: -place.worth):
         T = place.end.T_world_camera
         norms = [tangent_norms(better.end.T_world_camera, T) for better in found]

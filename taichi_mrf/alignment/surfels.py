@@ -7,12 +7,15 @@ which are added up over keyframes as messages are.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.geometry.poses import Pose
+
+if TYPE_CHECKING:
+    from taichi_mrf.alignment.oriented_points import OrientedPoints
 
 _HALF = 1 << 20
 """Cells are numbered from minus this along each axis, three times 21 bits in one int64."""
@@ -77,7 +80,7 @@ class Planes:
     normals: NDArray[np.float64]
 
 
-def surfels_of(points: OrientedPoints, T_world_camera: Pose, cell_size: float) -> Surfels:
+def surfels_of(points: "OrientedPoints", T_world_camera: Pose, cell_size: float) -> Surfels:
     """The surfels of one keyframe. A point that the sensor is unsure of counts less."""
     rotation = T_world_camera[:3, :3].T
     world = points.points.astype(np.float64) @ rotation + T_world_camera[:3, 3]

@@ -22,7 +22,7 @@ STACK_NAME = "depth_m"
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Listed:
     path: Path
     number: int | None
     """Position in the stack; None where the file is one image."""
@@ -65,11 +65,11 @@ class DepthFiles:
             depth_m = self._metres(array if place.number is None else array[place.number])
         return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
 
-    def _of_folder(self, folder: Path) -> dict[str, _Place]:
-        places: dict[str, _Place] = {}
+    def _of_folder(self, folder: Path) -> dict[str, _Listed]:
+        places: dict[str, _Listed] = {}
         for path in sorted(p for p in folder.iterdir() if p.suffix in FORMATS):
             found = (
-                self._of_stack(path, path.stem) if path.suffix == ".npz" else {path.stem: _Place(path, None)}
+                self._of_stack(path, path.stem) if path.suffix == ".npz" else {path.stem: _Listed(path, None)}
             )
             for name, place in found.items():
                 if name in places:
@@ -77,16 +77,16 @@ class DepthFiles:
                 places[name] = place
         return places
 
-    def _of_stack(self, path: Path, prefix: str) -> dict[str, _Place]:
+    def _of_stack(self, path: Path, prefix: str) -> dict[str, _Listed]:
         array = self._array(path)
         if array.ndim == 2:
-            return {prefix or path.stem: _Place(path, None)}
+            return {prefix or path.stem: _Listed(path, None)}
         if array.ndim != 3:
             raise DatasetError(
                 f"{path}: contains an array of shape {array.shape}, not a stack (N, H, W) of depth"
             )
         start = f"{prefix}-" if prefix else ""
-        return {f"{start}{number:04d}": _Place(path, number) for number in range(len(array))}
+        return {f"{start}{number:04d}": _Listed(path, number) for number in range(len(array))}
 
     def _array(self, path: Path) -> NDArray:
         """The array of a file; that of the last file is kept, since stacks are read image by image."""

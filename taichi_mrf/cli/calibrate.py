@@ -25,6 +25,7 @@ from taichi_mrf.calibration.truth_sources import (
 )
 from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera
@@ -126,12 +127,7 @@ def _ground_truth(
 
 
 def _print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:
-    table = Table(show_header=False, title=f"Noise learnt from {report['depth']}", title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for name, text in _rows(report):
-        table.add_row(name, text)
-    console.print(table)
+    print_facts(console, f"Noise learnt from {report['depth']}", _rows(report))
     console.print(_noise_table(report["noise"]))
     for sentence in report["not_covered"]:
         console.print_line(sentence)

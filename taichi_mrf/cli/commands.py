@@ -10,18 +10,14 @@ from typing import Any
 
 import tyro
 
-from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.options.config_file import laser_parameters, live_parameters, mapping_parameters
-from taichi_mrf.cli.options.diff import Diff
 from taichi_mrf.cli.options.doctor import Doctor
-from taichi_mrf.cli.options.eval import Eval
-from taichi_mrf.cli.options.export import Export
-from taichi_mrf.cli.options.import_map import Import
-from taichi_mrf.cli.options.info import Info
 from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.measure import Bench, Eval
+from taichi_mrf.cli.options.saved_maps import Diff, Export, Import, Info
 from taichi_mrf.cli.options.tune import Tune
 
 
@@ -103,7 +99,7 @@ _LASER_FLAGS = (
 )
 
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
+    "map": Command(Map, "taichi_mrf.cli.map.run:run_map", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
@@ -111,9 +107,9 @@ COMMANDS = {
     "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),
     "info": Command(Info, "taichi_mrf.cli.info:run_info"),
     "doctor": Command(Doctor, "taichi_mrf.cli.doctor:run_doctor"),
-    "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench", None, _BENCH_FLAGS),
+    "bench": Command(Bench, "taichi_mrf.cli.bench:run_bench", None, _BENCH_FLAGS),
     "calibrate": Command(Calibrate, "taichi_mrf.cli.calibrate:run_calibrate"),
     "eval": Command(Eval, "taichi_mrf.cli.eval:run_eval"),
-    "laser": Command(Laser, "taichi_mrf.cli.laser.run:run_laser", laser_parameters, _LASER_FLAGS),
+    "laser": Command(Laser, "taichi_mrf.cli.laser:run_laser", laser_parameters, _LASER_FLAGS),
 }
 """Every command by name, in the order of the help."""

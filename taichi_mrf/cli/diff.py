@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from taichi_mrf.cli.options.diff import Diff
+from taichi_mrf.cli.options.saved_maps import Diff
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.changes import write_changes

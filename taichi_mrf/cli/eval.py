@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-from taichi_mrf.cli.options.eval import Eval
+from taichi_mrf.cli.options.measure import Eval
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
@@ -47,7 +47,7 @@ def run_eval(options: Eval, experiments: Mapping[str, Any] | None = None) -> int
                 tables, paths = _run(laboratory.run_experiment, name, known[name], options, console, request)
             except _StoppedError:
                 console.print_line("Stopped before the end; the same command continues from here.", "yellow")
-                return 128 + (request.signal or 0)
+                return request.exit_status
             except TaichiMRFError as error:
                 if len(names) == 1:
                     raise

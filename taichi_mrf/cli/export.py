@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.cli.options.export import Export
+from taichi_mrf.cli.options.saved_maps import Export
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError

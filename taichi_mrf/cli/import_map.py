@@ -6,7 +6,7 @@ import json
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.cli.options.import_map import Import
+from taichi_mrf.cli.options.saved_maps import Import
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config

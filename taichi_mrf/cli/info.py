@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from taichi_mrf.cli.options.info import Info
+from taichi_mrf.cli.options.saved_maps import Info
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Arch, Config

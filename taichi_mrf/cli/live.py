@@ -48,8 +48,8 @@ def run_live(options: Live) -> int:
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.cli.shared.learn_noise import learn_noise
         from taichi_mrf.runs.folder import write_run
-        from taichi_mrf.session.run import Policy
         from taichi_mrf.session.session import Session
+        from taichi_mrf.session.session_core import Policy
         from taichi_mrf.session.source import open_source
 
         def learn(dataset: "Dataset", config: Config) -> "LearntSigma":
@@ -71,7 +71,7 @@ def run_live(options: Live) -> int:
         )
         for note in notes:
             print_line(note)
-        policy = Policy(options.keep_live, options.out, options.exit_when_done)
+        policy = Policy(options.out, options.exit_when_done, options.keep_live)
         session = Session(source, page.link, policy, page.listening)
         with bar:
             problem = _run(session.run, session.reconnect, page, request)
@@ -91,12 +91,10 @@ def run_live(options: Live) -> int:
                 print_line(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)
-    if request.signal is not None:
-        return 128 + request.signal
-    if session.state.full is not None:
+    if session.state.full is not None and not request():
         print_problem(f"out of memory: {session.state.full}; the map of the frames before it is kept")
         return DID_NOT_FIT
-    return 0
+    return request.exit_status
 
 
 class _ProgressLink(ViewerLink):

@@ -39,9 +39,10 @@ def run_tune(options: Tune) -> int:
         from taichi_mrf.datasets import open_dataset
         from taichi_mrf.datasets.recorded_noise import with_tuned_noise
         from taichi_mrf.errors import DatasetError
+        from taichi_mrf.session.session_core import Policy
         from taichi_mrf.system import runtime
         from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
-        from taichi_mrf.tune.session import Policy, TuneSession
+        from taichi_mrf.tune.session import TuneSession
 
         runtime.init(settings.runtime.arch, settings.runtime.threads)
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
@@ -57,14 +58,15 @@ def run_tune(options: Tune) -> int:
             _tell_noise(options, settings, learnt, print_line)
         search = None
         if options.auto is not None:
-            search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
+            names = options.names or DEFAULT_SEARCH
+            search = Search(settings, names, options.auto, options.seed, options.search_stride)
         printed: set[int] = set()
         session = TuneSession(
             dataset,
             settings,
             choice,
             link,
-            Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
+            Policy(options.out, leave_when_done=not options.viewer),
             search=search,
             listening=lambda where: print_address(where, "The page", options.port, options.open, print_line),
             tried=lambda attempt: _print_trial(attempt, session.search, printed, print_line),
@@ -83,7 +85,7 @@ def run_tune(options: Tune) -> int:
         lost = link.lost
     if lost is not None and not request():
         raise TaichiMRFError(lost)
-    return 0 if request.signal is None else 128 + request.signal
+    return request.exit_status
 
 
 def _page(options: Tune, print_line: PrintLine, stack: ExitStack) -> ViewerLink:
@@ -136,7 +138,7 @@ def _finish(session: "TuneSession", options: Tune, print_line: PrintLine) -> Non
 
 def _verdict(session: "TuneSession") -> list[str]:
     """The gain of the search on views that it has not used, line by line; empty until it has ended."""
-    from taichi_mrf.tune.verdict import verdict_lines
+    from taichi_mrf.tune.trial import verdict_lines
 
     return verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
 

@@ -15,9 +15,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from taichi_mrf.cluster.child import pickled_task, result_of
-from taichi_mrf.cluster.processes import ProcessDiedError, TaskProcesses
+from taichi_mrf.cluster.processes import ProcessDiedError, TaskProcesses, environment_of, threads_for
 from taichi_mrf.cluster.runner import ATTEMPTS, R, T, TaskLostError, gather, nothing
-from taichi_mrf.cluster.share import environment_of, threads_for
 from taichi_mrf.errors import ClusterError
 from taichi_mrf.system.libraries import library
 

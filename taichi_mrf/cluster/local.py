@@ -7,9 +7,8 @@ from functools import partial
 from typing import Any
 
 from taichi_mrf.cluster.child import pickled_task, result_of
-from taichi_mrf.cluster.processes import ProcessDiedError, TaskProcesses
+from taichi_mrf.cluster.processes import ProcessDiedError, TaskProcesses, environment_of
 from taichi_mrf.cluster.runner import ATTEMPTS, R, T, TaskLostError, gather, nothing
-from taichi_mrf.cluster.share import environment_of
 from taichi_mrf.errors import ConfigError
 
 _GLANCE = 0.5

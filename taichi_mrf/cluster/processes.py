@@ -1,4 +1,4 @@
-"""The processes of tasks, seen from the one that starts them.
+"""The processes of tasks, seen from the one that starts them, and the share of a machine that each gets.
 
 Neither multiprocessing nor ProcessPoolExecutor works here: a Dask worker is a daemon, which must not start
 their processes; a pool breaks as a whole when one process is killed; and the environment of a process has
@@ -14,9 +14,15 @@ import threading
 from collections.abc import Mapping
 
 from taichi_mrf.cluster.child import read_block, write_block
+from taichi_mrf.system import devices
+from taichi_mrf.system.devices import cores
 
 _LAST_SECONDS = 60.0
 """Longest wait for the end of a process that has answered, in seconds."""
+
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
+THREADS = ("TI_CPU_MAX_NUM_THREADS", "QD_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""Variables that Taichi, NumPy's BLAS and OpenCV read; ``runtime.threads``, if given, overrides the first."""
 
 
 class ProcessDiedError(Exception):
@@ -114,3 +120,27 @@ def _end(returncode: int) -> str:
     if returncode >= 0:
         return f"its process ended with exit status {returncode} and no answer"
     return f"its process was killed by {signal.Signals(-returncode).name}"
+
+
+def gpus() -> list[str]:
+    """The CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    visible = os.environ.get(VISIBLE_GPUS)
+    if visible is not None:
+        return [name for name in visible.split(",") if name]
+    return [str(number) for number in range(devices.cuda_device_count())]
+
+
+def environment_of(worker: int, workers: int) -> dict[str, str]:
+    """The environment variables of the ``worker``-th (from 0) of ``workers`` that share this machine."""
+    environment = threads_for(workers)
+    found = gpus()
+    if len(found) > 1:
+        environment[VISIBLE_GPUS] = found[worker % len(found)]
+    return environment
+
+
+def threads_for(workers: int) -> dict[str, str]:
+    """The environment variables that divide the cores among so many; variables that the user has set are
+    not changed."""
+    threads = str(max(1, cores() // workers))
+    return {name: threads for name in THREADS if workers > 1 and name not in os.environ}

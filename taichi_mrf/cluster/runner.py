@@ -1,4 +1,4 @@
-"""The interface of a task runner, and the simplest one."""
+"""The interface of a task runner, and what the runners share."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
@@ -39,20 +39,6 @@ class TaskRunner(Protocol):
         which a function may save its work), their last results are passed to ``done``, then
         KeyboardInterrupt is raised again. A second Ctrl-C kills them.
         """
-
-
-class InProcess:
-    """One task after the other in this process, for tests and debugging."""
-
-    def run(
-        self, function: Callable[[T], R], tasks: Sequence[T], done: Callable[[int, R], None] = nothing
-    ) -> list[R]:
-        """See TaskRunner, without its protection against dying processes."""
-        results = []
-        for index, task in enumerate(tasks):
-            results.append(function(task))
-            done(index, results[-1])
-        return results
 
 
 class TaskLostError(ClusterError):

@@ -19,9 +19,8 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
-from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.queries.survey import SurfaceSurvey
-from taichi_mrf.queries.view import View
+from taichi_mrf.queries.view import Answer, View
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
 

@@ -3,9 +3,7 @@
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
 voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3)
 int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
-If the map has them, ``colors`` (x, y, z, 4) uint8 are red, green, blue and how much was seen, and ``surface``
-(x, y, z, 3) float32 the weight, and distance and excess times weight, of DistanceField; 0 for nothing.
-``first_surface`` (x, y, z, 1) uint8 is 1 where the rays take a voxel for their first surface.
+The other layers that the map has (voxels/layers.py) are arrays (x, y, z, width) of their own, 0 for nothing.
 The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
 corner of the array's first voxel.
 """
@@ -24,10 +22,8 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.export.store_header import (
     CHUNKS,
-    EXTRAS,
     FORMAT,
     FORMAT_KEY,
-    LOG_ODDS,
     StoreHeader,
     StoreLayout,
     check_packed,
@@ -37,6 +33,7 @@ from taichi_mrf.system.atomic import temporary_name
 from taichi_mrf.system.files import exists, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layers import LAYERS, LOG_ODDS, Chunk, Layers, chunk_blocks
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 SUFFIX = ".zarr"
@@ -50,8 +47,6 @@ FARTHEST = 1 << 17
 LISTED_TOGETHER = 1 << 16
 """Chunks in one file of the list of a store that grows."""
 
-Chunk = tuple[int, int, int]
-
 
 class ChunkStore:
     """The chunks of a map on disk. Each is read and written by itself; different chunks may be written by
@@ -60,7 +55,7 @@ class ChunkStore:
     def __init__(self, path: Path, group: Any, layout: StoreLayout) -> None:
         """As :meth:`create` and :meth:`open` make it."""
         self.path, self.header, self._layout, self._group = path, layout.header, layout, group
-        self._array, self.extras = group[LOG_ODDS], layout.extras
+        self.layers = (LOG_ODDS, *layout.layers)
 
     @classmethod
     def create(
@@ -69,11 +64,11 @@ class ChunkStore:
         header: StoreHeader,
         chunks: NDArray[np.int32],
         grows: bool = False,
-        extras: Sequence[str] = (),
+        layers: Sequence[str] = (),
     ) -> "ChunkStore":
         """An empty store for some chunks, (n, 3), which the caller then writes. Its array covers their
-        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``. ``extras`` of
-        EXTRAS get arrays too.
+        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``. ``layers`` beside
+        log-odds get arrays too.
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
@@ -91,15 +86,12 @@ class ChunkStore:
             group = zarr.create_group(
                 store=str(path), attributes={FORMAT_KEY: FORMAT, **asdict(header), **place}
             )
-            group.create_array(
-                LOG_ODDS, shape=tuple(shape.tolist()), chunks=(CHUNK_VOXELS,) * 3, dtype="float32",
-                fill_value=float("nan"), dimension_names=("x", "y", "z"),
-            )  # fmt: skip
-            for name in extras:
-                data_type, values = EXTRAS[name]
+            for name in (LOG_ODDS, *layers):
+                layer, last = LAYERS[name], _last_axis(name)
                 group.create_array(
-                    name, shape=(*shape.tolist(), values), chunks=(*(CHUNK_VOXELS,) * 3, values),
-                    dtype=data_type, fill_value=0, dimension_names=("x", "y", "z", "value"),
+                    name, shape=(*shape.tolist(), *last), chunks=(*(CHUNK_VOXELS,) * 3, *last),
+                    dtype=layer.dtype, fill_value=layer.missing,
+                    dimension_names=("x", "y", "z", "value")[: 3 + len(last)],
                 )  # fmt: skip
             listed = np.ascontiguousarray(chunks, np.int32).reshape(-1, 3)
             in_one_file = (LISTED_TOGETHER if grows else max(1, len(listed)), 3)
@@ -151,55 +143,48 @@ class ChunkStore:
         """True if chunks can be added to it (growing_store.py)."""
         return self._layout.lowest_chunk == (-FARTHEST,) * 3
 
-    def file_of(self, chunk: Sequence[int], name: str = LOG_ODDS) -> Path:
-        """File of a chunk's log-odds, or of one of its extras, from the store's folder."""
-        last = () if name == LOG_ODDS else ("0",)
-        return Path(name, "c", *map(str, self._place(chunk)), *last)
+    def file_of(self, name: str, chunk: Sequence[int]) -> Path:
+        """File of a chunk's layer, from the store's folder."""
+        return Path(name, "c", *map(str, (*self._place(chunk), *(0 for _ in _last_axis(name)))))
 
-    def write(self, chunk: Sequence[int], log_odds: NDArray[np.float32]) -> None:
-        """Write one chunk, (64, 64, 64) log-odds, NaN for unknown. Raises MapFileError."""
-        try:
-            self._array.blocks[self._place(chunk)] = log_odds
-        except OSError as error:
-            raise MapFileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+    def write(self, layers: Layers) -> None:
+        """Write some bricks of layers, chunk by chunk: those of a chunk together. Raises MapFileError."""
+        for name, found in layers.items():
+            last = _last_axis(name)
+            for chunk, block in chunk_blocks(LAYERS[name], found):
+                place = (*self._place(chunk), *(0 for _ in last))
+                try:
+                    self._group[name].blocks[place] = block.reshape(*(CHUNK_VOXELS,) * 3, *last)
+                except OSError as error:
+                    raise MapFileError(
+                        f"{self.path}: cannot be written: {error.strerror or error}"
+                    ) from error
 
-    def read(self, chunk: Sequence[int]) -> NDArray[np.float32]:
-        """One of :attr:`chunks`, (64, 64, 64). Raises MapFileError."""
-        place = self._place(chunk)
-        check_packed(self.path / self.file_of(chunk), CHUNK_BYTES)
+    def read(self, name: str, chunk: Sequence[int]) -> NDArray:
+        """One of :attr:`layers` of one of :attr:`chunks`, (64, 64, 64), with a last axis for one of more than
+        one value. Raises MapFileError."""
+        layer, last = LAYERS[name], _last_axis(name)
+        size = int(np.prod(layer.chunk_shape)) * np.dtype(layer.dtype).itemsize
+        check_packed(self.path / self.file_of(name, chunk), size)
+        what = f"{name} of chunk {tuple(chunk)}"
         try:
-            found = np.asarray(self._array.blocks[place], np.float32)
+            place = (*self._place(chunk), *(0 for _ in last))
+            found = np.asarray(self._group[name].blocks[place], layer.dtype)
         except Exception as error:  # as above
-            raise MapFileError(f"{self.path}: chunk {tuple(chunk)} cannot be read: {said(error)}") from error
-        if found.shape != (CHUNK_VOXELS,) * 3 or np.isinf(found).any():
-            raise MapFileError(f"{self.path}: damaged: chunk {tuple(chunk)} holds a value that is not finite")
-        return found
-
-    def write_extra(self, name: str, chunk: Sequence[int], values: NDArray) -> None:
-        """Write one of :attr:`extras` for a chunk, (64, 64, 64, values). Raises MapFileError."""
-        try:
-            self._group[name].blocks[(*self._place(chunk), 0)] = values
-        except OSError as error:
-            raise MapFileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
-
-    def read_extra(self, name: str, chunk: Sequence[int]) -> NDArray:
-        """One of :attr:`extras` of one of :attr:`chunks`, (64, 64, 64, values). Raises MapFileError."""
-        data_type, values = EXTRAS[name]
-        size = CHUNK_VOXELS**3 * values * np.dtype(data_type).itemsize
-        check_packed(self.path / self.file_of(chunk, name), size)
-        try:
-            found = np.asarray(self._group[name].blocks[(*self._place(chunk), 0)], data_type)
-        except Exception as error:  # as above
-            raise MapFileError(
-                f"{self.path}: {name} of chunk {tuple(chunk)} cannot be read: {said(error)}"
-            ) from error
-        if found.shape != (*(CHUNK_VOXELS,) * 3, values) or not np.isfinite(found).all():
-            raise MapFileError(f"{self.path}: damaged: {name} of chunk {tuple(chunk)} are not finite numbers")
-        return found
+            raise MapFileError(f"{self.path}: {what} cannot be read: {said(error)}") from error
+        unfit = np.isinf(found) if np.isnan(layer.missing) else ~np.isfinite(found)
+        if found.shape != (*(CHUNK_VOXELS,) * 3, *last) or unfit.any():
+            raise MapFileError(f"{self.path}: damaged: {what} holds a value that is not finite")
+        return found.reshape(layer.chunk_shape)
 
     def _place(self, chunk: Sequence[int]) -> Chunk:
         x, y, z = (np.array(chunk, np.int64) - self._layout.lowest_chunk).tolist()
         return x, y, z
+
+
+def _last_axis(name: str) -> tuple[int, ...]:
+    """The last axis of a layer's array: log-odds have none."""
+    return () if name == LOG_ODDS else (LAYERS[name].width,)
 
 
 @contextmanager

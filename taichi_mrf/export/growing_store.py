@@ -7,58 +7,46 @@ without its file.
 
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_store import FARTHEST, Chunk, ChunkStore
+from taichi_mrf.export.chunk_store import FARTHEST, ChunkStore
 from taichi_mrf.export.store_header import CHUNKS, StoreHeader
 from taichi_mrf.system.atomic import temporary_name
 from taichi_mrf.system.files import exists
+from taichi_mrf.voxels.layers import LOG_ODDS, Layers
 
 _DOCUMENT = "zarr.json"
 
 
-Extras = Mapping[str, Mapping[Chunk, NDArray]]
-"""By the names of EXTRAS and by chunks: (64, 64, 64, values) each."""
-
-
-def put_chunks(
-    path: Path, header: StoreHeader, blocks: Mapping[Chunk, NDArray[np.float32]], extras: Extras | None = None
-) -> None:
-    """Write some chunks, (64, 64, 64) log-odds each, NaN for unknown, into the store ``path``, which is made
-    if it does not exist; chunks that are there already are replaced, as are those of their ``extras`` that
-    are named. Raises MapFileError, also for a store that was not made here, and TaichiMRFError without zarr.
-    """
-    extras = extras or {}
-    new = np.array(list(blocks), np.int32).reshape(-1, 3)
+def put_chunks(path: Path, header: StoreHeader, put: NDArray[np.int32], layers: Layers) -> None:
+    """Write the layers of some chunks ``put`` (n, 3) into the store ``path``, which is made if it does not
+    exist; of chunks that are there already the named layers are replaced. Raises MapFileError, also for a
+    store that was not made here, and TaichiMRFError without zarr."""
+    new = put.reshape(-1, 3)
     if len(new) and max(-int(new.min()), int(new.max()) + 1) > FARTHEST:
         raise MapFileError(f"{path}: a chunk further than {FARTHEST} chunks from the origin has no place")
     grown = exists(path)
     listed = _listed(path) if grown else new[:0]
     known = set(map(tuple, listed.tolist()))
-    added = [chunk for chunk in blocks if chunk not in known]
+    added = [chunk for chunk in new.tolist() if tuple(chunk) not in known]
     chunks = np.concatenate([listed, np.array(added, np.int32).reshape(-1, 3)])
     staging = temporary_name(path)
     try:
-        stage = ChunkStore.create(staging, header, chunks, grows=True, extras=tuple(extras))
-        for chunk, block in blocks.items():
-            stage.write(chunk, block)
-        for name, found in extras.items():
-            for chunk, values in found.items():
-                stage.write_extra(name, chunk, values)
+        others = tuple(name for name in layers if name != LOG_ODDS)
+        stage = ChunkStore.create(staging, header, chunks, grows=True, layers=others)
+        stage.write(layers)
         if not grown:
             os.replace(staging, path)
             return
-        for name in extras:
-            _move(staging, path, Path(name, _DOCUMENT))
-            for chunk in blocks:
-                _move(staging, path, stage.file_of(chunk, name))
-        for chunk in blocks:
-            _move(staging, path, stage.file_of(chunk))
+        for name in (*others, LOG_ODDS):
+            if name != LOG_ODDS:
+                _move(staging, path, Path(name, _DOCUMENT))
+            for chunk in new.tolist():
+                _move(staging, path, stage.file_of(name, chunk))
         if added:
             for file in sorted((staging / CHUNKS / "c").glob("*/0")):
                 _move(staging, path, file.relative_to(staging))

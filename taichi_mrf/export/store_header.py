@@ -15,16 +15,12 @@ from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_name
 from taichi_mrf.system.files import check_regular, exists, open_regular, read_text
-from taichi_mrf.voxels.distance_field import VALUES
+from taichi_mrf.voxels.layers import LAYERS, LOG_ODDS
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 FORMAT = 1
 FORMAT_KEY = "taichi_mrf_map"
-LOG_ODDS, CHUNKS = "log_odds", "chunks"
-COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
-
-EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", VALUES), FIRST: ("uint8", 1)}
-"""Extras that a store may hold of each voxel, 0 for nothing: the type and number of their values."""
+CHUNKS = "chunks"
 
 _MOST_BYTES = 1_000_000
 _LARGEST_VOXEL_M = 1000.0
@@ -71,14 +67,15 @@ class StoreHeader:
 @dataclass(frozen=True)
 class StoreLayout:
     """The header, the first of the chunks that there is room for, (3,), how many there are along each axis,
-    how many of them are listed, how many together in one file of the list, and the ``extras`` there are."""
+    how many of them are listed, how many together in one file of the list, and the ``layers`` beside
+    log-odds that there are."""
 
     header: StoreHeader
     lowest_chunk: tuple[int, int, int]
     chunks_across: tuple[int, int, int]
     listed: int
     listed_together: int
-    extras: tuple[str, ...] = ()
+    layers: tuple[str, ...] = ()
 
 
 def read_layout(folder: Path) -> StoreLayout:
@@ -98,12 +95,13 @@ def read_layout(folder: Path) -> StoreLayout:
     (listed, three), together = _array(folder, CHUNKS, "int32", 0, 2)
     if (three, together[1]) != (3, 3) or listed > math.prod(across):
         raise _damaged(folder, f"{CHUNKS} has the shape ({listed}, {three})")
-    extras = tuple(name for name in EXTRAS if exists(folder / name))
-    for name in extras:
-        data_type, values = EXTRAS[name]
-        if _array(folder, name, data_type, 0, 4) != ((*shape, values), (*chunk_shape, values)):
+    layers = tuple(name for name in LAYERS if name != LOG_ODDS and exists(folder / name))
+    for name in layers:
+        layer = LAYERS[name]
+        sides = _array(folder, name, layer.dtype, 0, 4)
+        if sides != ((*shape, layer.width), (*chunk_shape, layer.width)):
             raise _damaged(folder, f"{name} is not made of the chunks of {LOG_ODDS}")
-    return StoreLayout(header, lowest, across, listed, together[0], extras)
+    return StoreLayout(header, lowest, across, listed, together[0], layers)
 
 
 def check_packed(path: Path, size: int) -> None:

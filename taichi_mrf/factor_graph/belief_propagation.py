@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph
-from taichi_mrf.factor_graph.workers import Workers, workers_for
+from taichi_mrf.factor_graph.workers import BeamWorkers, beam_workers
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template
@@ -55,7 +55,7 @@ class _State(Bundle):
 @kernel
 def send(
     order: I32Array, begin: I32, end: I32, graph: BeamGraph, state: _State, damping: F32, tolerance: F32,
-    scratch: F32Array2, workers: Workers, soft: Template,
+    scratch: F32Array2, workers: BeamWorkers, soft: Template,
 ) -> None:  # fmt: skip
     """Renew the messages of beams ``order[begin:end]`` (eqs. 17 and 20), and add what they changed up.
 
@@ -150,7 +150,7 @@ class BeliefPropagation:
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config
         self.soft = config.method == "bp"
-        self.workers = workers_for(graph)
+        self.workers = beam_workers(graph)
         self.scratch = ti.ndarray(ti.f32, (self.workers.number * graph.longest, 2))
         self.messages = ti.ndarray(ti.f32, max(1, graph.edges))
         self.messages.fill(0.0)

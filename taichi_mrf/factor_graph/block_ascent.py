@@ -23,7 +23,7 @@ from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.dual_decomposition import units32
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph
-from taichi_mrf.factor_graph.workers import Workers, workers_for
+from taichi_mrf.factor_graph.workers import BeamWorkers, beam_workers
 from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import I32Array, I64Array
@@ -59,7 +59,7 @@ class _Found(Bundle):
 @kernel
 def _gather_and_give(
     graph: BeamGraph, multipliers: I32Array, share: I32Array, contested: I32Array, found: _Found,
-    scratch: I32Array, workers: Workers,
+    scratch: I32Array, workers: BeamWorkers,
 ) -> None:  # fmt: skip
     """One iteration over all beams. All values are in units.
 
@@ -116,7 +116,7 @@ class BlockAscent:
 
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config
-        self.workers = workers_for(graph)
+        self.workers = beam_workers(graph)
         self.scratch = ti.ndarray(ti.i32, self.workers.number * graph.longest)
         self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
         self.multipliers.fill(0)

@@ -7,8 +7,8 @@ from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, with
 
 
 @ti.dataclass
-class _Place(Struct):
-    """Place for a beam's next cell."""
+class _Cursor(Struct):
+    """Where a beam's next cell is written."""
 
     next: ti.i32
 
@@ -54,7 +54,7 @@ def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
     cells.
     """
     for beam in range(counts.shape[0]):
-        place = _Place(0)
+        place = _Cursor(0)
         walk_cells(rays, beam, shape, _count, place, counts)
         counts[beam] = place.next
 
@@ -64,7 +64,7 @@ def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array
     """Which cells each beam crosses, into ``cells`` (edges) from ``begins`` (beams + 1) on; ``rays`` as
     above."""
     for beam in range(begins.shape[0] - 1):
-        place = _Place(begins[beam])
+        place = _Cursor(begins[beam])
         walk_cells(rays, beam, shape, _write, place, cells)
 
 

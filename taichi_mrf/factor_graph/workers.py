@@ -13,7 +13,7 @@ SCRATCH_BYTES = 256 << 20
 
 
 @dataclass(frozen=True)
-class Workers(Bundle):
+class BeamWorkers(Bundle):
     """Workers that take a part of all beams each."""
 
     number: I32
@@ -30,10 +30,10 @@ class Workers(Bundle):
         return first + ti.cast(ti.cast(end - first, ti.i64) * worker // self.number, ti.i32)
 
 
-def workers_for(graph: FactorGraph) -> Workers:
+def beam_workers(graph: FactorGraph) -> BeamWorkers:
     """Workers for the backend that runs."""
     if runtime.active() == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 512, graph.longest)
+        return BeamWorkers(64, 512, graph.longest)
     most = SCRATCH_BYTES // (8 * graph.longest)
-    return Workers(max(256, min(65536, most, graph.beams)), 1, graph.longest)
+    return BeamWorkers(max(256, min(65536, most, graph.beams)), 1, graph.longest)

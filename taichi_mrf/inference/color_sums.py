@@ -16,6 +16,7 @@ from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layers import BrickValues, of_voxels
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.strips import strip_begin, strip_length
@@ -83,6 +84,11 @@ class ColorShare:
     def chosen(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "ColorShare":
         """Those of some voxels: a mask (n,), or numbers of rows."""
         return ColorShare(self.bricks[rows], self.numbers[rows], self.rg[rows], self.bw[rows])
+
+    @property
+    def values(self) -> BrickValues:
+        """The colours as a layer."""
+        return of_voxels(self.bricks, self.numbers, self.colors())
 
     def colors(self) -> NDArray[np.uint8]:
         """The voxels' mean colours, (n, 4): red, green, blue, and the weight, at most 255."""

@@ -7,7 +7,7 @@ in a pool of bricks that a registry allocates.
 import dataclasses
 import weakref
 from collections.abc import Iterable
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,21 +21,24 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.queries.contradiction import ray_scores
-from taichi_mrf.queries.extract import extract_voxels
-from taichi_mrf.queries.measured_depth import Answer, MeasuredDepth
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import View
-from taichi_mrf.queries.within import occupied_within, path_collision
+from taichi_mrf.queries.view import Answer, View
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.later import later
 from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology, create_topology, recycle
+
+if TYPE_CHECKING:
+    from taichi_mrf.queries import contradiction, extract, within
+    from taichi_mrf.queries.measured_depth import MeasuredDepth
+else:
+    contradiction, extract, within = later("taichi_mrf.queries", "contradiction", "extract", "within")
 
 MapT = TypeVar("MapT", bound="BrickMap")
 SectionT = TypeVar("SectionT")
@@ -173,7 +176,7 @@ class BrickMap(Owned):
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
-        return extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
+        return extract.extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
 
     @tensors.in_kind("T_world_camera")
     def render_depth(
@@ -204,7 +207,7 @@ class BrickMap(Owned):
             return np.full(camera.shape, np.nan, np.float32)
         return measured.near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
 
-    def _measured_surface(self) -> MeasuredDepth | None:
+    def _measured_surface(self) -> "MeasuredDepth | None":
         """The surface that keyframes measured, as rays meet it; None in maps without one."""
         return None
 
@@ -228,20 +231,20 @@ class BrickMap(Owned):
     ) -> NDArray[np.float32]:
         """How much each pixel of a depth image that is not in the map contradicts it, (H, W) float32 in nats:
         above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
-        return ray_scores(self, depth_m, T_world_camera, camera, own)
+        return contradiction.ray_scores(self, depth_m, T_world_camera, camera, own)
 
     @tensors.in_kind("points")
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` metres of points (N, 3) in metres, (N,)
         float32 (queries.within). Raises ConfigError, CapacityError if the points lie too far apart."""
-        return occupied_within(points, radius_m, *self._likely_grid())
+        return within.occupied_within(points, radius_m, *self._likely_grid())
 
     @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that a ball of ``radius_m`` metres hits something on its way from point to point: a
         path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as
         :meth:`occupied_within`, and ConfigError for a path without points."""
-        return path_collision(points, radius_m, *self._likely_grid())
+        return within.path_collision(points, radius_m, *self._likely_grid())
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         return point_log_odds(points, *self._grid())

@@ -15,7 +15,7 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
-from taichi_mrf.methods.mrf.checkpoint import Checkpoint
+from taichi_mrf.methods.mrf.inferring import Checkpoint
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.posed import PoseUpdate
 from taichi_mrf.methods.mrf.reading import Layer, MapReading

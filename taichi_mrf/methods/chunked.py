@@ -14,8 +14,7 @@ from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
-from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
-from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
+from taichi_mrf.export.chunk_store import CHUNK_BYTES, ChunkStore
 from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
@@ -25,6 +24,7 @@ from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layers import COLORS, FIRST, LOG_ODDS, SURFACE, Chunk
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, join_bricks, split_bricks
 
 _BYTES_PER_VOXEL = 9
@@ -81,7 +81,7 @@ class ChunkedMap:
         self._most = int(cache_mb * 1e6) // CHUNK_BYTES
         self._known = set(map(tuple, self.chunks.tolist()))
         self._cache: OrderedDict[Chunk, NDArray[np.float32]] = OrderedDict()
-        self._colors = lru_cache(self._most)(lambda chunk: store.read_extra(COLORS, chunk))
+        self._colors = lru_cache(self._most)(lambda chunk: store.read(COLORS, chunk))
 
     @classmethod
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
@@ -96,7 +96,7 @@ class ChunkedMap:
     @cached_property
     def decided(self) -> "ChunkedMap":
         """The map by what is occupied, as MRFMap.decided; itself if the store holds no votes of rays."""
-        if self._by != "marginal" or FIRST not in self.store.extras:
+        if self._by != "marginal" or FIRST not in self.store.layers:
             return self
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "decided")
 
@@ -118,12 +118,12 @@ class ChunkedMap:
     @property
     def has_colors(self) -> bool:
         """True if the store holds the colours that cameras saw."""
-        return COLORS in self.store.extras
+        return COLORS in self.store.layers
 
     @property
     def has_surface(self) -> bool:
         """True if the store holds what keyframes measured of the surface."""
-        return SURFACE in self.store.extras
+        return SURFACE in self.store.layers
 
     @property
     def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -249,7 +249,7 @@ class ChunkedMap:
 
     def _block(self, chunk: Chunk) -> NDArray[np.float32]:
         if chunk not in self._cache:
-            block = self._read_by_rays(chunk, self.store.read(chunk))
+            block = self._read_by_rays(chunk, self.store.read(LOG_ODDS, chunk))
             self._cache[chunk] = block
             while len(self._cache) > self._most:
                 self._cache.popitem(last=False)
@@ -266,7 +266,7 @@ class ChunkedMap:
         likely = self._calibrated_chunk(chunk, shown) if self.has_surface else shown
         if self._by == "decided":
             least = called(prior, min_evidence)
-            first = ~unknown & (self.store.read_extra(FIRST, chunk)[..., 0] > 0)
+            first = ~unknown & (self.store.read(FIRST, chunk) > 0)
             shown[first] = np.maximum(shown[first], least)
             if self.has_surface:
                 carry(likely.reshape(-1), shown.reshape(-1), prior, min_evidence, least)

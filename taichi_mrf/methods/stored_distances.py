@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.chunk_store import Chunk, ChunkStore
-from taichi_mrf.export.store_header import SURFACE
+from taichi_mrf.export.chunk_store import ChunkStore
 from taichi_mrf.voxels.distance_field import VALUES, DistanceField, Sums
+from taichi_mrf.voxels.layers import SURFACE, Chunk
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, split_bricks
 
 _HELD = 64
@@ -29,7 +29,7 @@ class StoredDistances:
         inside = (chunks >= first // CHUNK_VOXELS) & (chunks <= (after - 1) // CHUNK_VOXELS)
         self._chunks = chunks[inside.all(axis=1)]
         self._known = set(map(tuple, self._chunks.tolist()))
-        self._read = lru_cache(_HELD)(lambda chunk: store.read_extra(SURFACE, chunk))
+        self._read = lru_cache(_HELD)(lambda chunk: store.read(SURFACE, chunk))
 
     @property
     def chunks(self) -> NDArray[np.int32]:

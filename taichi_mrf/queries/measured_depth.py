@@ -8,8 +8,6 @@ negative one, if that is near the voxel along the surface's normal, and not in t
 rays with a large sigma leave such places in front of a surface.
 """
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +26,6 @@ from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, within
 from taichi_mrf.voxels.window import Window, WindowIndex
-
-Answer = Literal["surface", "omega"]
-"""End of a ray: on the measured surface near its likeliest voxel, or in that voxel alone."""
 
 NEAR_VOXELS, NEAR_M = 1.5, 0.075
 """How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the

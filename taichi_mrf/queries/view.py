@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,9 @@ from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.window import Window, WindowIndex
+
+Answer = Literal["surface", "omega"]
+"""End of a ray: on the measured surface near its likeliest voxel, or in that voxel alone."""
 
 _ALL_DIM = Occlusion()
 _NO_NOISE = NoiseTable(np.zeros((1, 2, 5), np.float32), 1 << 30, 1)

@@ -2,53 +2,26 @@
 colours that cameras saw, and the same keyframes mapped by OctoMap's method."""
 
 import dataclasses
-import hashlib
-import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Protocol
 
-import numpy as np
-
-from taichi_mrf.config.registry import octomap_method
-from taichi_mrf.config.schema import Config, without_window
-from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.inference.schedule import InferProgress, Progress, StopRequestedError
-from taichi_mrf.methods.capabilities import takes_colors
-from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.queries.colored import painted
-from taichi_mrf.sensor.noise import NoiseModel
-from taichi_mrf.session.change_list import ChangeList
-from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
 from taichi_mrf.session.pictures import view_images
-from taichi_mrf.session.publish import Publisher
 from taichi_mrf.session.run import Run
-from taichi_mrf.session.shown_surface import ShownSurface
-from taichi_mrf.viewer.messages import BrickColors, Bricks, Notice, SceneChanges, Update, Watch
-from taichi_mrf.voxels.layout import VOXELS, by_chunk
+from taichi_mrf.session.shown_extras import BaselineOverlay, ChangeList, ShownColors, ShownSurface
+from taichi_mrf.viewer.messages import Notice, Update, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
 IMAGE_SECONDS = 1.0
 """Shortest time between two sets of images, in seconds."""
 
-COLOR_SHARE = 0.1
-"""Looking for new colours takes at most this share of the time while frames come."""
-
 ASK_SECONDS = 0.05
 """Shortest time between two looks at requests during long work, in seconds."""
 
-LEAST_LOG_ODDS = 0.0
-"""Bricks without any voxel more likely occupied than not are not sent: in this map every brick that a ray
-crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free never falls below 0.12."""
-
-
-class GoOn(Protocol):
-    """Called between two steps of long work: carries out requests, and returns whether to go on."""
-
-    def __call__(self, step: InferProgress | None = None) -> bool: ...
+GoOn = Callable[[InferProgress | None], bool]
+"""Called between two steps of long work, of inference with its step. Carries out requests, and returns if
+work goes on."""
 
 
 class Extras:
@@ -131,12 +104,7 @@ class Extras:
         """Look for what appeared and what left; False if it was nothing."""
         if self._changes is None:
             self._changes = ChangeList(self._run.mapper)
-        look = self._changes.look
-        found: list[SceneChanges] = []
-        self._run.guarded(lambda: found.extend(look()))
-        for changes in found:
-            self._run.send(changes)
-        return bool(found)
+        return self._send_found(self._changes.look)
 
     def _send_colors(self) -> bool:
         """Send the colours of voxels that have changed; False if there were none."""
@@ -144,11 +112,14 @@ class Extras:
             return False
         if self._colors is None:
             self._colors = ShownColors(self._run.mapper)
-        changes = self._colors.changes
-        found: list[BrickColors] = []
-        self._run.guarded(lambda: found.extend(changes()))
-        for colors in found:
-            self._run.send(colors)
+        return self._send_found(self._colors.changes)
+
+    def _send_found(self, find: Callable[[], Sequence[Update]]) -> bool:
+        """Send the updates that are found, if finding them raises nothing; False if there are none."""
+        found: list[Update] = []
+        self._run.guarded(lambda: found.extend(find()))
+        for update in found:
+            self._run.send(update)
         return bool(found)
 
     def _send_surface(self, go_on: GoOn) -> bool:
@@ -205,7 +176,7 @@ class Extras:
             if time.monotonic() - asked < ASK_SECONDS:
                 return
             self._run.show_activity(doing, 0.0)
-            if not go_on() or not wanted():
+            if not go_on(None) or not wanted():
                 raise StopRequestedError
             asked = time.monotonic()
 
@@ -233,99 +204,3 @@ class Extras:
             self._run.send(
                 view_images(mapper.map, frame.name, frame.camera, frame.T_world_camera, frame.depth_m)
             )
-
-
-class ShownColors:
-    """Finds the colours to send of one map. While keyframes come, only theirs are added; once the map has
-    settled, all are computed from its final marginals."""
-
-    def __init__(self, mapper: Mapper) -> None:
-        self._mapper = mapper
-        self._sent: dict[tuple[int, int, int], bytes] = {}
-        self._next = -math.inf
-        self._seen: tuple[int, bool, int] | None = None
-
-    def changes(self) -> list[BrickColors]:
-        """The colours of the chunks that have changed since the last call, chunk by chunk; none if that was a
-        moment ago."""
-        m, begin = self._mapper.map, time.monotonic()
-        if not takes_colors(m) or not m.has_colors or (begin < self._next and not m.settled):
-            return []
-        pool = m.view.pool
-        state = pool.revision, m.settled, len(m.keyframes)
-        if state == self._seen:
-            return []
-        self._seen = state
-        slots = pool.in_use
-        found = m.colors_in(slots) if m.settled else m.recent_colors().reshape(-1, VOXELS, 4)[slots]
-        news = []
-        for chunk, rows in by_chunk(pool.bricks[slots]):
-            colors = painted(found[rows])
-            digest = hashlib.blake2b(colors.tobytes(), digest_size=8).digest()
-            if self._sent.get(chunk) != digest:
-                self._sent[chunk] = digest
-                news.append(BrickColors(chunk, np.ascontiguousarray(pool.bricks[slots[rows]]), colors))
-        now = time.monotonic()
-        self._next = now + (now - begin) / COLOR_SHARE
-        return news
-
-
-class BaselineOverlay:
-    """A map by OctoMap's method that follows a mapper's keyframes, one piece of work at a time."""
-
-    def __init__(self, config: Config, noise: NoiseModel) -> None:
-        """An empty map with a configuration's parameters, but for the window, which its method lacks, and
-        for time: OctoMap's update forgets nothing."""
-        static = replace(without_window(config), time=TimeConfig())
-        self.map: OccupancyMap = octomap_method().load_class().with_noise(static, noise)
-        self._publisher = Publisher(
-            "baseline",
-            self.map.view.pool,
-            self.map.seen_by,
-            prior_is_unknown=True,
-            least_log_odds=LEAST_LOG_ODDS,
-        )
-        self._places: dict[int, tuple[int, Pose]] = {}
-        """The viewer's number of a keyframe -> its number and pose here."""
-        self._stale = False
-
-    def catch_up(self, mapper: Mapper, progress: Progress) -> bool:
-        """Do one piece of the work that is left: add a keyframe, or integrate all anew after some have gone
-        or moved, which ``progress`` can stop. Returns whether there was any.
-
-        A frozen keyframe that is in this map stays in it; one that was frozen before cannot be added.
-        """
-        entries = mapper.roster.entries
-        for id, (here, pose) in list(self._places.items()):
-            entry = entries.get(id)
-            if entry is None or entry.state == "off":
-                self.map.remove_keyframe(here)
-                del self._places[id]
-                self._stale = True
-            elif not np.array_equal(entry.T_world_camera, pose):
-                self.map.move_keyframe(here, entry.T_world_camera)
-                self._places[id] = here, entry.T_world_camera
-                self._stale = True
-        if self._stale:
-            self._stale = not self.map.infer(progress=progress).complete
-            return True
-        for entry in mapper.roster.with_state("on"):
-            if entry.id not in self._places:
-                image = mapper.posed_image(entry)
-                parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s)
-                here = self.map.add_keyframe(image.depth_m, *parts, **image.own.arguments())
-                self._places[entry.id] = here, entry.T_world_camera
-                return True
-        return False
-
-    def changes(self) -> Bricks | None:
-        """The changes that were not sent yet; None while the map is being rebuilt."""
-        return None if self._stale else self._publisher.changes()
-
-    def start_over(self) -> None:
-        """Send the whole map with the next changes: the viewer is a new one."""
-        self._publisher.start_over()
-
-    def everything_gone(self) -> Bricks:
-        """The update that removes this map from the page."""
-        return self._publisher.everything_gone()

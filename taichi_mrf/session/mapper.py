@@ -7,6 +7,7 @@ only on its keyframes and their poses, bit for bit.
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,79 @@ from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
-from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
-from taichi_mrf.sensor.own_evidence import NOTHING
-from taichi_mrf.session.live_keyframes import LiveKeyframe, LiveKeyframes
+from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap, PosedDepth
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.session.pictures import thumbnail
 from taichi_mrf.session.ray_answers import PosedDepthImage
 from taichi_mrf.session.shown_map import ShownMap
+from taichi_mrf.system import runtime
 from taichi_mrf.viewer import messages
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeState
+
+
+@dataclass
+class LiveKeyframe:
+    """One keyframe. ``map_id`` is its number in the map while it is on. While it is off, ``depth_m`` (H, W)
+    is its depth image in metres, 0 for no measurement, ``color`` (H, W, 3) its colour image, if it has one,
+    and ``own`` what it states of its measurements. A frozen keyframe has none of them.
+
+    ``T_recorded`` is the recorded pose and ``T_home`` the one found by alignment, which is the same if poses
+    are not refined; ``moved_by_hand``: a user has moved it elsewhere.
+    """
+
+    id: int
+    name: str
+    T_world_camera: Pose
+    camera: Camera
+    rays: int
+    shown: Camera
+    picture: NDArray[np.uint8]
+    map_id: int | None
+    stamp_s: float
+    state: KeyframeState = "on"
+    depth_m: NDArray[np.float32] | None = None
+    color: NDArray[np.uint8] | None = None
+    own: OwnEvidence = NOTHING
+    moved_by_hand: bool = False
+
+    def __post_init__(self) -> None:
+        self.T_recorded = self.T_home = self.T_world_camera
+
+
+@dataclass
+class LiveKeyframes:
+    """All keyframes of a run by number, in the order in which they came. A number is never given twice."""
+
+    entries: dict[int, LiveKeyframe] = field(default_factory=dict)
+    next_id: int = 0
+
+    def add(
+        self,
+        frame: PosedDepth,
+        rays: int,
+        picture: tuple[Camera, NDArray[np.uint8]],
+        map_id: int,
+        stamp_s: float,
+    ) -> LiveKeyframe:
+        """Add a keyframe that has just been added to the map, with its pictures.thumbnail."""
+        entry = LiveKeyframe(
+            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, *picture, map_id, stamp_s
+        )
+        self.entries[entry.id] = entry
+        self.next_id += 1
+        return entry
+
+    def find(self, id: int) -> LiveKeyframe:
+        """A keyframe by the viewer's number. Raises KeyframeError."""
+        if id not in self.entries:
+            raise KeyframeError(f"there is no keyframe {id}")
+        return self.entries[id]
+
+    def with_state(self, state: KeyframeState) -> list[LiveKeyframe]:
+        """Those that are on, off or frozen, the oldest first."""
+        return [entry for entry in self.entries.values() if entry.state == state]
+
 
 RENEW_SECONDS = 0.1
 """Seconds for which keyframes are swept again, at most, before frames and requests are handled."""
@@ -71,6 +137,20 @@ class Mapper:
     def min_evidence(self) -> float:
         """Voxels whose published log-odds are nearer to the prior than this count as unknown."""
         return LOG_ODDS_STEP if self.map.METHOD.prior_is_unknown else self.map.config.volume.min_evidence
+
+    def hello(self, source: str) -> messages.Hello:
+        """The message that begins the map of a ``source`` in the viewer."""
+        backend = runtime.choice()
+        return messages.Hello(
+            source=source,
+            backend=backend.name if backend else "",
+            device=backend.device if backend else "",
+            method=self.map.config.method,
+            voxel_size=self.map.voxel_size,
+            prior_log_odds=self.map.view.pool.prior_log_odds,
+            min_evidence=self.min_evidence,
+            parameters="",
+        )
 
     @property
     def stale(self) -> bool:

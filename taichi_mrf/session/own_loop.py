@@ -17,8 +17,8 @@ from taichi_mrf.config.arguments import ArgumentTypeError, shown
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.session.link import Link, ViewerLink
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import Source
 from taichi_mrf.system.interrupts import interrupts_noted
 from taichi_mrf.viewer.messages import Listening

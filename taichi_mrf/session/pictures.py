@@ -10,7 +10,7 @@ from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.queries.measured_depth import Answer
+from taichi_mrf.queries.view import Answer
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.unrolled import covering, unrolled
 from taichi_mrf.viewer.messages import Images

@@ -10,8 +10,7 @@ import numpy as np
 from taichi_mrf.runs.files import MAP_FILE, MESH_FILE, VOXEL_FILE
 from taichi_mrf.runs.folder import write_mesh_file, write_report, write_voxel_file
 from taichi_mrf.session.extras import Extras
-from taichi_mrf.session.live_keyframes import LiveKeyframe
-from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.ray_answers import pixel_answer, point_answer
 from taichi_mrf.session.run import Run
 from taichi_mrf.viewer.messages import (

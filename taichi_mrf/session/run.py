@@ -1,11 +1,13 @@
 """The state of a live run: its source, its map, and the connection to its page."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import replace
 
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
@@ -16,31 +18,78 @@ from taichi_mrf.methods.capabilities import (
     takes_colors,
     window_of,
 )
+from taichi_mrf.methods.protocol import MapStatistics
 from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.link import Link
-from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.pictures import outlined
-from taichi_mrf.session.progress import Progress
 from taichi_mrf.session.replay import Replay
-from taichi_mrf.session.session_core import SessionCore
-from taichi_mrf.session.shown_map import time_span
+from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
+from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
-from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
+from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
+
+RATE_SECONDS = 5.0
+"""Seconds over which the keyframe rate is averaged."""
 
 
-@dataclass(frozen=True)
-class Policy:
-    """Rules that a run follows on its own. ``keep_live``: most keyframes that are on before some are frozen,
-    None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
-    source has ended and the map is settled."""
+class Progress:
+    """Makes Status messages."""
 
-    keep_live: int | None = None
-    out: Path | None = None
-    leave_when_done: bool = False
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._taken: deque[float] = deque()
+        self._begin = clock()
+        self._measured: MapStatistics | None = None
+
+    def keyframe_taken(self) -> None:
+        """Count a keyframe for the rate."""
+        self._taken.append(self._clock())
+
+    def measure(self, mapper: Mapper) -> None:
+        """Measure the map's size, which takes too long for every message."""
+        self._measured = mapper.map.statistics()
+
+    def status(
+        self, activity: str, share: float, replay: Replay | None, mapper: Mapper, waiting: bool
+    ) -> Status:
+        """``waiting``: edits wait until the present work is done."""
+        if self._measured is None:
+            self.measure(mapper)
+        assert self._measured is not None
+        states = [entry.state for entry in mapper.roster.entries.values()]
+        return Status(
+            activity,
+            share,
+            replay.number if replay else 0,
+            replay.frames if replay else 0,
+            states.count("on"),
+            states.count("frozen"),
+            self._rate(),
+            self._measured.voxels,
+            self._measured.bricks,
+            self._measured.memory_mb,
+            replay.paused if replay else False,
+            replay.finished if replay else True,
+            waiting or mapper.edited,
+            replay.speed if replay and replay.has_pace else None,
+        )
+
+    def _rate(self) -> float:
+        now = self._clock()
+        while self._taken and self._taken[0] < now - RATE_SECONDS:
+            self._taken.popleft()
+        return len(self._taken) / max(min(RATE_SECONDS, now - self._begin), 1e-3)
+
+
+def sweeping(step: InferProgress) -> tuple[str, float]:
+    """A step of full inference in words, and how much of it is done."""
+    done = (step.sweep - 1) * step.keyframes + step.keyframe
+    sentence = f"sweeping keyframe {step.keyframe} of {step.keyframes} (sweep {step.sweep} of {step.sweeps})"
+    return sentence, done / (step.sweeps * step.keyframes)
 
 
 class Run(SessionCore):
@@ -54,8 +103,8 @@ class Run(SessionCore):
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
         """Makes the map. Raises TaichiMRFError."""
-        super().__init__(link)
-        self.source, self.policy = source, policy
+        super().__init__(link, policy)
+        self.source = source
         self.version = 0
         self.full: str | None = None
         self.replay: Replay | None = None
@@ -93,16 +142,10 @@ class Run(SessionCore):
 
     def send_everything(self) -> None:
         """Send a viewer that has just started the whole state."""
-        m, backend = self.mapper.map, runtime.choice()
+        m = self.mapper.map
         self.send(
-            Hello(
-                source=self.source.name,
-                backend=backend.name if backend else "",
-                device=backend.device if backend else "",
-                method=m.config.method,
-                voxel_size=m.voxel_size,
-                prior_log_odds=m.view.pool.prior_log_odds,
-                min_evidence=self.mapper.min_evidence,
+            replace(
+                self.mapper.hello(self.source.name),
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,
@@ -164,7 +207,7 @@ class Run(SessionCore):
 
     def show_activity(self, activity: str, share: float) -> None:
         """Show the present activity in the viewer, and the share of it that is done, 0 to 1."""
-        waiting = self.inbox.has_edits()
+        waiting = self.waiting.has_edits()
         self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
 
     def notice_error(self, error: Exception) -> None:
@@ -215,8 +258,15 @@ class Run(SessionCore):
         poses_may_change = self.follower is not None and not self.follower.is_final
         return not (frames_left or poses_may_change or self.mapper.unsettled or self.mapper.unaligned)
 
+    def idle(self) -> float:
+        """Show why there is nothing to do; returns the seconds until the next frame, if one is due earlier
+        than requests are looked at."""
+        self.show_activity(self._idle_activity, 1.0)
+        due = self.replay.due_in() if self.replay else None
+        return WAIT_SECONDS if due is None else min(due, WAIT_SECONDS)
+
     @property
-    def idle_activity(self) -> str:
+    def _idle_activity(self) -> str:
         """In words, why there is nothing to do."""
         if self.replay is None:
             return "waiting: the map is up to date"
@@ -239,3 +289,17 @@ class Run(SessionCore):
     def _show_adding(self, frame: Frame) -> None:
         self.show_camera(frame)
         self.show_activity(f"adding {frame.name}", self.replay.share if self.replay else 0.0)
+
+
+def time_span(shown: ShownMap, entries: Collection[LiveKeyframe]) -> TimeSpan | None:
+    """The times at which a map can be shown; None for a map without dates or keyframes.
+
+    Frozen keyframes count from the newest of them on, and before that the map would lack them.
+    """
+    on = [entry.stamp_s for entry in entries if entry.state == "on"]
+    frozen = [entry.stamp_s for entry in entries if entry.state == "frozen"]
+    if not shown.has_dates or not on + frozen:
+        return None
+    first = max(frozen) if frozen else min(on)
+    start = min(entry.stamp_s for entry in entries)  # also of those that are off, or all times would shift
+    return TimeSpan(start, first, max(on + frozen), shown.stamp_s)

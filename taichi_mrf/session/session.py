@@ -30,12 +30,11 @@ from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.extras import Extras
 from taichi_mrf.session.link import Link
-from taichi_mrf.session.live_keyframes import LiveKeyframe
-from taichi_mrf.session.progress import sweeping
+from taichi_mrf.session.mapper import LiveKeyframe
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.requests import Requests, resumes_replay
-from taichi_mrf.session.run import Policy, Run
-from taichi_mrf.session.session_core import EDITS, WAIT_SECONDS
+from taichi_mrf.session.run import Run, sweeping
+from taichi_mrf.session.session_core import EDITS, Policy
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
@@ -67,20 +66,9 @@ class Session:
         self._asked = float("-inf")
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Work until told to stop: by ``should_stop``, by the viewer's Quit, or because the link is lost.
-
-        Can be called again, after :meth:`reconnect` for instance.
-        """
-        state = self.state
-        state.should_stop = should_stop
-        while not state.is_over:
-            self.answer()
-            if not state.is_over and not self._work():
-                if state.policy.leave_when_done and state.is_done:
-                    return
-                state.show_activity(state.idle_activity, 1.0)
-                due = state.replay.due_in() if state.replay else None
-                state.link.wait(WAIT_SECONDS if due is None else min(due, WAIT_SECONDS))
+        """Work until told to stop (:meth:`.SessionCore.work_until_over`). Can be called again, after
+        :meth:`reconnect` for instance."""
+        self.state.work_until_over(should_stop, self.answer, self._work)
 
     def answer(self) -> None:
         """Carry out what the page has asked for."""
@@ -104,8 +92,8 @@ class Session:
     def _carry_out_waiting(self) -> None:
         """Carry out what has been asked for; signals are looked at between any two requests."""
         state, begin = self.state, time.monotonic()
-        while len(state.inbox) and not state.is_over and self._may_carry_out(state.inbox.next):
-            self._requests.carry_out(state.inbox.take())
+        while len(state.waiting) and not state.is_over and self._may_carry_out(state.waiting.next):
+            self._requests.carry_out(state.waiting.take())
             if state.is_replaying and time.monotonic() - begin > REQUEST_SECONDS:
                 return
 
@@ -137,7 +125,7 @@ class Session:
         """True if an edit or what the page shows waits for the messages of a map from a file."""
         mapper = self.state.mapper
         wanted = (
-            self.state.inbox.has_edits() or self._extras.need_messages or mapper.shown.stamp_s is not None
+            self.state.waiting.has_edits() or self._extras.need_messages or mapper.shown.stamp_s is not None
         )
         return mapper.lacks_messages and wanted
 
@@ -289,15 +277,15 @@ class Session:
         state.read_requests()
         kept: list[Request] = []
         go_on = not state.is_over
-        while len(state.inbox) and go_on:
-            request = state.inbox.take()
+        while len(state.waiting) and go_on:
+            request = state.waiting.take()
             if isinstance(request, EDITS) or (resumes_replay(request) and state.has_frames_left):
                 kept.append(request)
                 go_on = not self._may_carry_out(request)
             else:
                 self._requests.carry_out(request)
                 go_on = not state.is_over
-        state.inbox.put_back(kept)
+        state.waiting.put_back(kept)
         if go_on and state.follower is not None:
             go_on = not state.follower.look(self._time_s())
         if go_on:

@@ -2,11 +2,13 @@
 
 One thread does all of a session's work, because Taichi may be used by one thread only. Between two pieces of
 work it reads the page's requests. Requests that arrive faster than they are carried out do not pile up: a
-later one replaces a waiting one of its kind (:class:`Inbox`).
+later one replaces a waiting one of its kind (:class:`WaitingRequests`).
 """
 
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 from taichi_mrf.session.link import Link
@@ -33,8 +35,8 @@ EDITS = (Switch, Freeze, Move, Reset)
 OF_ONE_KEYFRAME = (Switch, Freeze, Move)
 
 
-class Inbox:
-    """Requests that wait, the oldest first.
+class WaitingRequests:
+    """The requests of the page that are not carried out yet, the oldest first.
 
     A request replaces the last one about the same thing if that is of the same kind: of ten moves of a
     keyframe only the last is carried out, but a move, a freeze and another move stay three requests. A Reset
@@ -91,16 +93,27 @@ def _subject(request: Request) -> Hashable:
     return type(request).__name__
 
 
+@dataclass(frozen=True)
+class Policy:
+    """Rules that a session follows without being asked. ``out``: folder for the files that a user saves.
+    ``leave_when_done``: end once there is nothing left to do. ``keep_live``: most keyframes of a live run
+    that are on before some are frozen, None for no limit."""
+
+    out: Path | None = None
+    leave_when_done: bool = False
+    keep_live: int | None = None
+
+
 class SessionCore:
-    """The session's connection to its page: ``link`` sends and receives, ``inbox`` holds the requests that
-    wait; ``ended``: the user has quit."""
+    """The session's connection to its page, and the order of its work: ``link`` sends and receives,
+    ``waiting`` holds the requests that are not carried out yet; ``ended``: the user has quit."""
 
     EXPECTED: ClassVar[type[Exception]] = Exception
     """Errors in one piece of work that do not end the session."""
 
-    def __init__(self, link: Link) -> None:
-        self.link = link
-        self.inbox = Inbox()
+    def __init__(self, link: Link, policy: Policy) -> None:
+        self.link, self.policy = link, policy
+        self.waiting = WaitingRequests()
         self.ended = False
         self.should_stop: Callable[[], bool] = lambda: False
 
@@ -109,10 +122,36 @@ class SessionCore:
         """True if work has to stop: after a signal, after Quit, or when the page is lost."""
         return self.should_stop() or self.ended or self.link.lost is not None
 
+    @property
+    def is_done(self) -> bool:
+        """True if a session without work has nothing to wait for but requests."""
+        return True
+
+    def work_until_over(
+        self, should_stop: Callable[[], bool], answer: Callable[[], None], work: Callable[[], bool]
+    ) -> None:
+        """Work until told to stop: by ``should_stop``, by the viewer's Quit, or because the link is lost.
+
+        ``answer`` carries out what the page has asked for, ``work`` does the next piece of work and returns
+        whether there was any.
+        """
+        self.should_stop = should_stop
+        while not self.is_over:
+            answer()
+            if self.is_over or work():
+                continue
+            if self.policy.leave_when_done and self.is_done:
+                return
+            self.link.wait(self.idle())
+
+    def idle(self) -> float:
+        """Show that there is nothing to do; returns for how many seconds to wait at most."""
+        return WAIT_SECONDS
+
     def read_requests(self) -> None:
         """Read the requests that have arrived."""
         for request in self.link.requests():
-            self.inbox.put(request)
+            self.waiting.put(request)
 
     def send(self, update: Update) -> None:
         """Send an update to the page."""

@@ -8,17 +8,16 @@ was saved at rest is first shown by what is occupied.
 
 import math
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.methods.capabilities import has_dates, has_layers
-from taichi_mrf.methods.mrf.layers import NOTHING_MOVES, Moving
+from taichi_mrf.methods.mrf.moving_voxels import NOTHING_MOVES, Moving
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.session.live_keyframes import LiveKeyframe
 from taichi_mrf.session.publish import Publisher
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, TimeSpan
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -162,17 +161,3 @@ class ShownMap:
         belief = self._shown_pool.read("belief", slots[rows])
         out[rows] = np.where(self._moving.voxels[places], belief, np.float32(NOT_DYNAMIC))
         return out
-
-
-def time_span(shown: ShownMap, entries: Collection[LiveKeyframe]) -> TimeSpan | None:
-    """The times at which a map can be shown; None for a map without dates or keyframes.
-
-    Frozen keyframes count from the newest of them on, and before that the map would lack them.
-    """
-    on = [entry.stamp_s for entry in entries if entry.state == "on"]
-    frozen = [entry.stamp_s for entry in entries if entry.state == "frozen"]
-    if not shown.has_dates or not on + frozen:
-        return None
-    first = max(frozen) if frozen else min(on)
-    start = min(entry.stamp_s for entry in entries)  # also of those that are off, or all times would shift
-    return TimeSpan(start, first, max(on + frozen), shown.stamp_s)

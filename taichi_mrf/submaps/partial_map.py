@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference.messages import withdraw_messages
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.surfacing import measured_bricks
 from taichi_mrf.queries.known_bricks import sorted_bricks
 from taichi_mrf.system import runtime
 
@@ -62,3 +63,7 @@ class PartialMap(MRFMap):
         """The bricks that any ray crosses, whether they exist or not; ascending."""
         found = [k.footprint.window.bricks_of(k.footprint.crossed) for k in self._keyframes.values()]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
+
+    def measured_bricks(self) -> NDArray[np.int32]:
+        """The bricks (n, 3) in which keyframes that are not frozen have a say in the surface; ascending."""
+        return measured_bricks(self._parts)

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile, open_npz
-from taichi_mrf.voxels.distance_field import VALUES, DistanceField
+from taichi_mrf.voxels.layers import LAYERS, SURFACE, BrickValues, Layers
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.topology import SparseTopology
 
@@ -55,18 +55,15 @@ class SubmapReport:
 @dataclass(frozen=True)
 class RoundResult:
     """The result of a submap: the beliefs in the bricks that it owns, the bricks that it owns in which rays
-    met no surface, and the evidence for each neighbour; if they are wanted, the ``colors`` (n, 512, 4) of the
-    former, the ``surface`` in whatever of its space keyframes measured it, and the voxels (n, 512) that rays
-    take for their ``first`` surface."""
+    met no surface, and the evidence for each neighbour; and those other ``layers`` of its space that are
+    wanted."""
 
     bricks: Bricks
     belief: LogOdds
     free_bricks: Bricks
     halos: Mapping[int, Halo]
     report: SubmapReport
-    colors: NDArray[np.uint8] | None = None
-    surface: DistanceField | None = None
-    first: NDArray[np.bool_] | None = None
+    layers: Layers = field(default_factory=dict)
 
 
 def round_path(folder: Path, round: int, submap: int) -> Path:
@@ -82,13 +79,8 @@ def write_round(path: Path, result: RoundResult) -> None:
         "free_bricks": result.free_bricks,
         "report": np.asarray(json.dumps(asdict(result.report))),
     }
-    if result.colors is not None:
-        arrays["colors"] = result.colors
-    if result.surface is not None:
-        arrays["surface_bricks"] = result.surface.bricks
-        arrays["surface_sums"] = result.surface.sums
-    if result.first is not None:
-        arrays["first"] = result.first.astype(np.uint8)
+    for name, found in result.layers.items():
+        arrays[f"{name}_bricks"], arrays[f"{name}_values"] = found.bricks, found.values
     for other, (bricks, evidence) in result.halos.items():
         arrays[f"halo_{other}_bricks"], arrays[f"halo_{other}_evidence"] = bricks, evidence
     try:
@@ -136,29 +128,21 @@ def read_places(path: Path) -> list[Bricks]:
     """Only where the core is: its bricks, those without voxels, and those in which the surface was measured,
     if that is wanted."""
     with _opened(path) as file:
-        names = ("bricks", "free_bricks", "surface_bricks")
+        names = ("bricks", "free_bricks", f"{SURFACE}_bricks")
         return [_bricks(file, name) for name in names if name in file]
 
 
-def read_colors(path: Path) -> NDArray[np.uint8] | None:
-    """The colours of the core's bricks, (n, 512, 4); None if they were not made."""
+def read_layer(path: Path, name: str) -> BrickValues:
+    """One of the other layers of the core. Raises MapFileError if it was not made."""
     with _opened(path) as file:
-        return file.array("colors", "u", (None, VOXELS, 4)).astype(np.uint8) if "colors" in file else None
-
-
-def read_first(path: Path) -> NDArray[np.bool_] | None:
-    """The voxels of the core's bricks that rays take for a surface, (n, 512); None if they were not made."""
-    with _opened(path) as file:
-        return file.array("first", "u", (None, VOXELS)) > 0 if "first" in file else None
-
-
-def read_surface(path: Path) -> DistanceField | None:
-    """The signed distances in the core; None if they were not made."""
-    with _opened(path) as file:
-        if "surface_bricks" not in file:
-            return None
-        bricks = _bricks(file, "surface_bricks")
-        return DistanceField.of(bricks, file.array("surface_sums", "f", (len(bricks), VOXELS, VALUES)))
+        if f"{name}_bricks" not in file:
+            raise MapFileError(
+                f"{path}: holds no {name}: its round was not meant to be the last; --resume "
+                "with more --rounds makes them"
+            )
+        bricks, layer = _bricks(file, f"{name}_bricks"), LAYERS[name]
+        values = file.array(f"{name}_values", "uf", (len(bricks), VOXELS, *layer.shape))
+        return BrickValues(bricks, values.astype(layer.dtype))
 
 
 def read_core(path: Path) -> tuple[Bricks, LogOdds, Bricks]:

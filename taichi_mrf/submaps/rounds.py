@@ -15,28 +15,25 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.chunk_blocks import chunk_block, extra_block, first_block
 from taichi_mrf.export.chunk_store import ChunkStore, new_store
-from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
+from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.inference.ray_model import Limits
-from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
-from taichi_mrf.submaps.plan import plan_submaps
+from taichi_mrf.submaps.plan import PLAN_FILE, Job, SourceFrames, plan_submaps
 from taichi_mrf.submaps.round_files import (
     SubmapReport,
-    read_colors,
     read_core,
-    read_first,
+    read_layer,
     read_places,
     read_report,
-    read_surface,
     round_path,
 )
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.system.atomic import write_text
-from taichi_mrf.voxels.layout import CHUNK, VOXELS, by_chunk
+from taichi_mrf.voxels.layers import LOG_ODDS, BrickValues, known_log_odds
+from taichi_mrf.voxels.layout import CHUNK, VOXELS
 
 SETTLED = 0.001
 """The rounds end when at most this share of all voxels has changed in the last one."""
@@ -67,7 +64,7 @@ class SubmapsResult:
 
 
 def map_in_submaps(
-    sequence: Sequence,
+    sequence: SourceFrames,
     config: Config,
     submap_size: float,
     folder: Path,
@@ -129,7 +126,7 @@ def _check(config: Config, rounds: int) -> None:
 
 
 def _job(
-    sequence: Sequence,
+    sequence: SourceFrames,
     config: Config,
     submap_size: float,
     folder: Path,
@@ -244,42 +241,12 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     header = StoreHeader.of(config, *log_odds, config.volume.min_evidence, up)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
-        extras = [name for name, kept in _wanted(config) if kept]
-        store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0), extras=extras)
+        layers = job.layers
+        store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0), layers=layers)
         for file in files:
-            _merge_extras(store, file)
+            for name in () if read_report(file).has_nothing else layers:
+                store.write({name: read_layer(file, name)})
             bricks, belief, free = read_core(file)
             empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
             bricks, belief = np.concatenate([bricks, free]), np.concatenate([belief, empty])
-            for chunk, rows in by_chunk(bricks):
-                block = chunk_block(chunk, bricks[rows], belief[rows], header.prior_log_odds)
-                store.write(chunk, block)
-
-
-def _wanted(config: Config) -> tuple[tuple[str, bool], ...]:
-    """Extras that a store may hold beside log-odds, and whether it does."""
-    return (COLORS, config.color), (SURFACE, config.keep_surface), (FIRST, config.keep_surface)
-
-
-def _merge_extras(store: ChunkStore, file: Path) -> None:
-    """Write the colours and the surface of a submap's core. Raises MapFileError if its file has none."""
-    bricks, report = read_places(file)[0], read_report(file)
-    if report.has_nothing:
-        return
-    colors, surface, first = read_colors(file), read_surface(file), read_first(file)
-    for name, found in ((COLORS, colors), (SURFACE, surface), (FIRST, first)):
-        if name in store.extras and found is None:
-            raise MapFileError(
-                f"{file}: holds no {name}: its round was not meant to be the last; --resume "
-                "with more --rounds makes them"
-            )
-    if colors is not None:
-        for chunk, rows in by_chunk(bricks):
-            store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors[rows]))
-    if first is not None:
-        for chunk, rows in by_chunk(bricks):
-            store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], first[rows]))
-    if surface is not None:
-        sums = surface.sums
-        for chunk, rows in by_chunk(surface.bricks):
-            store.write_extra(SURFACE, chunk, extra_block(chunk, surface.bricks[rows], sums[rows]))
+            store.write({LOG_ODDS: BrickValues(bricks, known_log_odds(belief, header.prior_log_odds))})

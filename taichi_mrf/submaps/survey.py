@@ -12,9 +12,8 @@ from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Z_UP, Up, up_of
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
-from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import SeenKeyframe
+from taichi_mrf.submaps.plan import SeenKeyframe, SourceFrames
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import CHUNK
 
@@ -26,7 +25,7 @@ FRAMES_AT_ONCE = 128
 class SurveyTask:
     """Look at the frames ``indices`` of a sequence."""
 
-    sequence: Sequence
+    sequence: SourceFrames
     config: Config
     indices: tuple[int, ...]
 
@@ -80,7 +79,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
 
 
 def find_keyframes(
-    sequence: Sequence,
+    sequence: SourceFrames,
     config: Config,
     runner: TaskRunner,
     skip_bad_frames: bool = False,

@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.queries.points import probability
-from taichi_mrf.submaps.job import Job
 from taichi_mrf.submaps.partial_map import PartialMap
+from taichi_mrf.submaps.plan import Job
 from taichi_mrf.submaps.round_files import (
     Bricks,
     Halo,
@@ -31,7 +30,7 @@ from taichi_mrf.submaps.round_files import (
 )
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
-from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layers import COLORS, FIRST, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import grid_keys
 
 MOVED = 0.01
@@ -113,7 +112,7 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
         assert inference.outcome is not None
         inferring = inference.outcome.seconds
         halos = _spoken(m, job, task.submap, {n: [id_of[i] for i in c] for n, c in neighbours.items()})
-    seen = _seen(m, job, task, core)
+    layers = _layers(m, job, task, core) if task.may_be_last else {}
     belief, size = m.beliefs(core), m.statistics()
     report = SubmapReport(
         submap=task.submap,
@@ -129,23 +128,21 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
         peak_memory_mb=peak_memory_mb(),
         surface_bricks=measured,
     )
-    return RoundResult(core, belief, free, halos, report, *seen)
+    return RoundResult(core, belief, free, halos, report, layers)
 
 
-def _seen(
-    m: PartialMap, job: Job, task: SubmapTask, core: Bricks
-) -> tuple[NDArray[np.uint8] | None, DistanceField | None, NDArray[np.bool_] | None]:
-    """The colours of the core's bricks, the surface in the core, and the voxels that rays take for it; None
-    for what is not wanted."""
-    colors, surface, first = None, None, None
-    if job.config.color and task.may_be_last:
-        colors = m.colors_in(m.slots(core))
-    if job.config.keep_surface and task.may_be_last:
+def _layers(m: PartialMap, job: Job, task: SubmapTask, core: Bricks) -> dict[str, BrickValues]:
+    """The layers of the core that are wanted beside log-odds."""
+    found, slots = {}, m.slots(core)
+    if COLORS in job.layers:
+        found[COLORS] = BrickValues(core, m.colors_in(slots))
+    if SURFACE in job.layers:
         field = m.surface_field()
         rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)
-        surface = DistanceField.of(field.bricks[rows], field.sums[rows])
-        first = m.first_surfaces()[m.slots(core)]
-    return colors, surface, first
+        found[SURFACE] = field.values.chosen(rows)
+    if FIRST in job.layers:
+        found[FIRST] = BrickValues(core, m.first_surfaces()[slots].astype(np.uint8))
+    return found
 
 
 def _core(job: Job, submap: int, bricks: Bricks) -> Bricks:

@@ -56,12 +56,15 @@ class Search:
     """A search of ``tries`` steps: :meth:`ask` for parameters, try them, :meth:`tell` the score.
 
     ``told`` counts the steps that were made, ``best`` is what did best among them, None before the first.
+    It looks at every ``pixel_stride``-th pixel, 0 for as many as a first look.
     """
 
-    def __init__(self, start: Config, names: Sequence[str], tries: int, seed: int) -> None:
+    def __init__(
+        self, start: Config, names: Sequence[str], tries: int, seed: int, pixel_stride: int = 0
+    ) -> None:
         """The first try is the configuration ``start`` itself, so that the best is never worse.
         Raises ConfigError for names that cannot be searched, and if Optuna is not installed."""
-        self.start, self.tries, self.told = start, tries, 0
+        self.start, self.tries, self.told, self.pixel_stride = start, tries, 0, pixel_stride
         self.best: Config | None = None
         self.best_log_likelihood = -math.inf
         self._dimensions = dimensions(names, start)

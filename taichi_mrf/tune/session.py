@@ -6,9 +6,7 @@ the newest slider values are always the ones being tried.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from taichi_mrf.config.schema import Config
@@ -17,14 +15,13 @@ from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.session.link import Link
 from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.session.outbox import merged
-from taichi_mrf.session.session_core import WAIT_SECONDS, SessionCore
+from taichi_mrf.session.session_core import Policy, SessionCore
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures, residuals_of
 from taichi_mrf.tune.history import Attempt, History
 from taichi_mrf.tune.search import Search
-from taichi_mrf.tune.trial import Trial, run_trial
-from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen
+from taichi_mrf.tune.trial import Judged, Trial, contenders, judge_unseen, run_trial
 from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
 from taichi_mrf.viewer.messages import File, Hello, Listening, Notice, Quit
 from taichi_mrf.viewer.tune.messages import (
@@ -41,17 +38,6 @@ from taichi_mrf.viewer.tune.messages import (
     Try,
     Tuning,
 )
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Rules that a session follows without being asked. ``out``: folder for the files that a user saves.
-    ``search_stride``: the automatic search looks at every so many-th pixel, 0 for that of a first look.
-    ``leave_when_done``: end with the search."""
-
-    out: Path | None = None
-    search_stride: int = 0
-    leave_when_done: bool = False
 
 
 class TuneSession(SessionCore):
@@ -75,8 +61,8 @@ class TuneSession(SessionCore):
         """Reads the working set and sends it to the page. ``search`` is carried out first. ``listening`` is
         called with the address of the page, ``tried`` after each try, ``judged`` with the scores on unseen
         views once the search has ended. Raises TaichiMRFError."""
-        super().__init__(link)
-        self._dataset, self._config, self._policy = dataset, config, policy
+        super().__init__(link, policy)
+        self._dataset, self._config = dataset, config
         self.search, self._tried, self._judged = search, tried, judged
         self.verdict: list[Judged] = []
         self._view = 0
@@ -94,22 +80,24 @@ class TuneSession(SessionCore):
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Work until told to stop: by ``should_stop``, by the viewer, or because the link is lost."""
-        self.should_stop = should_stop
-        while not self.is_over:
-            self._carry_out_requests()
-            if self.is_over:
-                return
-            if self._wanted is not None:
-                self.guarded(self._try_wanted)
-            elif self.search is not None and not self.search.done:
-                self.guarded(self._search_once)
-            elif self.search is not None and self.search.best is not None and not self._is_judged:
-                self.guarded(self._judge_found)
-            elif self._policy.leave_when_done:
-                return
-            else:
-                self.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
-                self.link.wait(WAIT_SECONDS)
+        self.work_until_over(should_stop, self._carry_out_requests, self._work)
+
+    def idle(self) -> float:
+        """Show that there is nothing to do; returns for how many seconds to wait at most."""
+        self.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
+        return super().idle()
+
+    def _work(self) -> bool:
+        """Do the next piece of work; returns whether there was any."""
+        if self._wanted is not None:
+            self.guarded(self._try_wanted)
+        elif self.search is not None and not self.search.done:
+            self.guarded(self._search_once)
+        elif self.search is not None and self.search.best is not None and not self._is_judged:
+            self.guarded(self._judge_found)
+        else:
+            return False
+        return True
 
     def _begin(self, choice: FrameChoice) -> None:
         """Start on a working set, with an empty table. If it raises, the old one stays."""
@@ -142,8 +130,8 @@ class TuneSession(SessionCore):
     def _carry_out_requests(self) -> None:
         """Carry out what the page has asked for; signals are looked at between any two requests."""
         self.read_requests()
-        while len(self.inbox) and not self.is_over:
-            request = self.inbox.take()
+        while len(self.waiting) and not self.is_over:
+            request = self.waiting.take()
             self.guarded(partial(self._handlers[type(request)], request))
 
     def _want(self, request: Try) -> None:
@@ -178,7 +166,7 @@ class TuneSession(SessionCore):
     def _search_once(self) -> None:
         """One step of the search. If a person's request interrupts it, it is repeated afterwards."""
         assert self.search is not None
-        config, stride = self.search.ask(), self._policy.search_stride or self._coarse
+        config, stride = self.search.ask(), self.search.pixel_stride or self._coarse
         try:
             trial = run_trial(config, self.frames, pixel_stride=stride, go_on=self._go_on())
         except TaichiMRFError:
@@ -275,11 +263,11 @@ class TuneSession(SessionCore):
     def _save(self, request: SaveTries) -> None:
         """Send a file to the browser that asked for it; with --out it is also left there."""
         name, text = self.history.file(request.kind, request.number)
-        if self._policy.out is not None:
-            write_text(self._policy.out / name, text)
+        if self.policy.out is not None:
+            write_text(self.policy.out / name, text)
         self.send(File(name, text.encode(), request.client))
-        if self._policy.out is not None:
-            self.send(Notice(f"{name} is in {self._policy.out}"))
+        if self.policy.out is not None:
+            self.send(Notice(f"{name} is in {self.policy.out}"))
 
     def _quit(self) -> None:
         self.ended = True
@@ -297,7 +285,7 @@ class MapPublisher:
         """Send a map with its keyframes. If grid, prior and keyframes are those of the map before, only
         bricks are sent, so that the picture does not go black in between."""
         before, self._shown = self._shown, Mapper(trial.map)
-        hello, publisher = self._describe(trial), self._shown.shown.publisher
+        hello, publisher = self._shown.hello(self._source), self._shown.shown.publisher
         bricks = publisher.changes() or publisher.everything_gone()
         keyframes = [self._shown.describe(entry) for entry in self._shown.roster.entries.values()]
         names = [keyframe.name for keyframe in keyframes]
@@ -310,20 +298,6 @@ class MapPublisher:
             self._link.send(keyframe)
         self._link.send(merged([*gone, bricks]))
         self._hello = hello
-
-    def _describe(self, trial: Trial) -> Hello:
-        assert self._shown is not None
-        backend = runtime.choice()
-        return Hello(
-            source=self._source,
-            backend=backend.name if backend else "",
-            device=backend.device if backend else "",
-            method=trial.config.method,
-            voxel_size=trial.map.voxel_size,
-            prior_log_odds=trial.map.view.pool.prior_log_odds,
-            min_evidence=self._shown.min_evidence,
-            parameters="",
-        )
 
 
 def _names(mapper: Mapper) -> list[str]:

@@ -12,12 +12,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.voxels.layers import LAYERS, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys, rows_around
 
 Sums = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Weights, and distances and excesses times weight."""
 
-VALUES = 3
+VALUES = LAYERS[SURFACE].width
 """How many sums a voxel has."""
 
 BLENDED_BELOW = 0.3
@@ -64,6 +65,11 @@ class DistanceField:
     def sums(self) -> NDArray[np.float32]:
         """All three, (n, 512, VALUES)."""
         return np.stack([self.weight, self.distance, self.excess], axis=-1)
+
+    @property
+    def values(self) -> BrickValues:
+        """All three as a layer."""
+        return BrickValues(self.bricks, self.sums)
 
     @staticmethod
     def of(bricks: NDArray[np.int32], sums: NDArray[np.float32]) -> "DistanceField":

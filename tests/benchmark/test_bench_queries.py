@@ -11,8 +11,8 @@ from console import as_process
 from taichi_mrf import ExportOptions, cast_rays, export_map
 from taichi_mrf.benchmark import queries
 from taichi_mrf.benchmark.keyframe_cost import Seconds
-from taichi_mrf.cli.bench.run import query_tables
-from taichi_mrf.cli.options.bench import Bench
+from taichi_mrf.cli.bench import query_tables
+from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 

@@ -67,9 +67,7 @@ def test_help_is_printed_without_loading_taichi_or_numpy() -> None:
 
 
 def test_bench_without_a_viewer_loads_no_page() -> None:
-    program = (
-        "import sys, taichi_mrf.cli.bench.run; print('viser' in sys.modules, 'matplotlib' in sys.modules)"
-    )
+    program = "import sys, taichi_mrf.cli.bench; print('viser' in sys.modules, 'matplotlib' in sys.modules)"
     assert output(program) == "False False"
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.cli.map.many import folder_names
+from taichi_mrf.cli.map.summary import folder_names
 from taichi_mrf.errors import ConfigError
 
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import cluster_tasks
 import pytest
 from cluster_dask import TESTS, dask_cluster
+from in_process import InProcess
 
-from taichi_mrf.cluster import dask_tasks, share
+from taichi_mrf.cluster import dask_tasks, processes
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.cluster.dask_tasks import DaskTasks
 from taichi_mrf.cluster.local import LocalProcesses
-from taichi_mrf.cluster.runner import ATTEMPTS, InProcess, TaskRunner
+from taichi_mrf.cluster.runner import ATTEMPTS, TaskRunner
 from taichi_mrf.errors import ClusterError, ConfigError, DatasetError, TaichiMRFError
 
 
@@ -45,7 +46,7 @@ def test_results_are_in_the_order_of_the_tasks_and_told_once(runner: TaskRunner)
 def test_each_task_is_on_the_main_thread_of_its_own_process(runner: TaskRunner) -> None:
     found = runner.run(cluster_tasks.where, [0, 1, 2])
     assert len({pid for pid, _, _ in found} | {os.getpid()}) == 4
-    share_of_two = str(max(1, share.cores() // 2))
+    share_of_two = str(max(1, processes.cores() // 2))
     for _, on_main_thread, environment in found:
         assert on_main_thread
         assert environment["TI_CPU_MAX_NUM_THREADS"] == share_of_two
@@ -123,14 +124,14 @@ def is_running(pid: int) -> bool:
 
 
 def test_each_worker_has_a_gpu_and_its_share_of_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(share, "cores", lambda: 8)
+    monkeypatch.setattr(processes, "cores", lambda: 8)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    given = [share.environment_of(worker, 3) for worker in range(3)]
+    given = [processes.environment_of(worker, 3) for worker in range(3)]
     assert [each["CUDA_VISIBLE_DEVICES"] for each in given] == ["3", "5", "3"]
     assert all(each["TI_CPU_MAX_NUM_THREADS"] == "2" and "OMP_NUM_THREADS" not in each for each in given)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    assert share.environment_of(0, 1) == {}
+    assert processes.environment_of(0, 1) == {}
 
 
 def test_what_cannot_be_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, plain, stamp, steps, writing
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, plain, stamp, steps
+from refusals import refused
 
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.color_camera import ColorCamera
-from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -49,30 +49,16 @@ def beside(bag: Bag, info: bool = True, tf: bool = True) -> None:
         bag.image(TOPIC, stamp(i), OWN_FRAME, picture(i, OWN), "rgb8")
 
 
-@pytest.fixture
-def opened(tmp_path: Path) -> Callable[..., Dataset]:
-    """Writes a bag of the parts with depth and poses, and opens it."""
-
-    def write(*parts: Callable[[Bag], None], kind: Kind = "ros1", query: str = "") -> Dataset:
-        path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
-        with writing(path, kind) as bag:
-            for part in (plain, *parts):
-                part(bag)
-        return open_dataset(f"{path}{query}")
-
-    return write
-
-
 @pytest.mark.parametrize("write", [registered, lambda bag: registered(bag, "bgra8"), compressed])
-def test_registered_colours_come_back(opened: Callable[..., Dataset], write: Callable[[Bag], None]) -> None:
-    dataset = opened(write, kind="mcap")
+def test_registered_colours_come_back(make: Callable[..., Path], write: Callable[[Bag], None]) -> None:
+    dataset = open_dataset(make(plain, write, kind="mcap"))
     for i in (2, 0, 4):
         np.testing.assert_array_equal(dataset.read(i).color, picture(i))
     assert any(note == f"color: {TOPIC}, registered to depth" for note in dataset.notes)
 
 
-def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(opened: Callable[..., Dataset]) -> None:
-    dataset = opened(beside)
+def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(make: Callable[..., Path]) -> None:
+    dataset = open_dataset(make(plain, beside))
     own = ColorCamera(OWN, inverse(T_depth_color))
     for i in range(COUNT):
         frame = dataset.read(i)
@@ -94,23 +80,22 @@ def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(opened: Callable[...
     ],
 )
 def test_colours_that_cannot_be_used_are_named(
-    opened: Callable[..., Dataset], write: Callable[[Bag], None], problem: str
+    make: Callable[..., Path], write: Callable[[Bag], None], problem: str
 ) -> None:
-    dataset = opened(write)
+    dataset = open_dataset(make(plain, write))
     assert dataset.read(0).color is None
     (note,) = [note for note in dataset.notes if note.startswith("color: ")]
     assert problem in note
 
 
-def test_a_colour_topic_can_be_chosen_and_must_be_one(opened: Callable[..., Dataset]) -> None:
+def test_a_colour_topic_can_be_chosen_and_must_be_one(make: Callable[..., Path]) -> None:
     def two(bag: Bag) -> None:
         registered(bag)
         bag.image("/left", 1.0, FRAME, picture(7), "bgr8")
 
-    dataset = opened(two, query="?color=/left")
+    path = make(plain, two)
+    dataset = open_dataset(f"{path}?color=/left")
     np.testing.assert_array_equal(dataset.read(0).color, picture(7)[..., ::-1])
     assert dataset.read(1).color is None
     assert any("4 of 5 images have none" in note for note in dataset.notes)
-    path = str(dataset.reader.path)  # type: ignore[attr-defined]
-    with pytest.raises(DatasetError, match="is not colour"):
-        open_dataset(f"{path}?color=/camera/depth/image_raw&depth=/camera/depth/image_raw")
+    refused(f"{path}?color=/camera/depth/image_raw&depth=/camera/depth/image_raw", "is not colour")

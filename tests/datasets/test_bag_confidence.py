@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, plain, stamp, steps, writing
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, plain, stamp, steps
+from refusals import refused
 
 from taichi_mrf.config.schema import Config, SensorConfig
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import DatasetError, FrameError
@@ -37,23 +38,11 @@ def expected(i: int) -> np.ndarray:
     return np.where(grades(i) > 0, sigma / np.maximum(grades(i) / 15, 0.1), np.inf)
 
 
-@pytest.fixture
-def opened(tmp_path: Path) -> Callable[..., Dataset]:
-    """Writes a bag of the parts with depth and poses, and opens it."""
-
-    def write(*parts: Callable[[Bag], None], kind: Kind = "ros1", query: str = "") -> Dataset:
-        path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
-        with writing(path, kind) as bag:
-            for part in (plain, *parts):
-                part(bag)
-        return open_dataset(f"{path}{query}", color=False)
-
-    return write
-
-
 @pytest.mark.parametrize(("kind", "shift", "encoding"), [("mcap", 4, "mono8"), ("ros1", 0, "8UC1")])
-def test_grades_are_a_sigma(opened: Callable[..., Dataset], kind: Kind, shift: int, encoding: str) -> None:
-    dataset = opened(lambda bag: confidence(bag, shift=shift, encoding=encoding), kind=kind)
+def test_grades_are_a_sigma(make: Callable[..., Path], kind: Kind, shift: int, encoding: str) -> None:
+    dataset = open_dataset(
+        make(plain, lambda bag: confidence(bag, shift=shift, encoding=encoding), kind=kind), color=False
+    )
     for i in (2, 0, 4):
         sigma_m = dataset.read(i).sigma_m
         assert sigma_m is not None
@@ -62,8 +51,10 @@ def test_grades_are_a_sigma(opened: Callable[..., Dataset], kind: Kind, shift: i
     assert f"confidence: {TOPIC}, as a sigma for each pixel" in dataset.notes
 
 
-def test_a_bag_without_confidence_states_no_sigma(opened: Callable[..., Dataset]) -> None:
-    dataset = opened(lambda bag: confidence(bag, "/other/confidence/image_rect_raw"))
+def test_a_bag_without_confidence_states_no_sigma(make: Callable[..., Path]) -> None:
+    dataset = open_dataset(
+        make(plain, lambda bag: confidence(bag, "/other/confidence/image_rect_raw")), color=False
+    )
     assert dataset.read(0).sigma_m is None
     assert not dataset.stated.pixel_sigma
     assert dataset.stated.sigma is None
@@ -77,8 +68,8 @@ def test_the_sigma_of_the_l515_is_the_makers_error_and_noise_together() -> None:
         )
 
 
-def test_an_image_without_confidence_has_the_same_sigma_everywhere(opened: Callable[..., Dataset]) -> None:
-    dataset = opened(lambda bag: confidence(bag, skip=3))
+def test_an_image_without_confidence_has_the_same_sigma_everywhere(make: Callable[..., Path]) -> None:
+    dataset = open_dataset(make(plain, lambda bag: confidence(bag, skip=3)), color=False)
     assert dataset.read(3).sigma_m is None
     assert dataset.read(4).sigma_m is not None
     assert any(note.endswith("; 1 of 5 images have none") for note in dataset.notes)
@@ -99,43 +90,41 @@ WRONG = [
 
 @pytest.mark.parametrize(("write", "problem"), WRONG)
 def test_confidence_that_does_not_fit_is_named(
-    opened: Callable[..., Dataset], write: Callable[[Bag], None], problem: str
+    make: Callable[..., Path], write: Callable[[Bag], None], problem: str
 ) -> None:
-    dataset = opened(write, query="?depth=/camera/depth/image_raw")
+    path = make(plain, write)
+    dataset = open_dataset(f"{path}?depth=/camera/depth/image_raw", color=False)
     assert not dataset.stated.pixel_sigma
     (note,) = [note for note in dataset.notes if note.startswith("confidence: ")]
     assert f"{TOPIC} is not used: " in note
     assert problem in note
-    path = str(dataset.reader.path)  # type: ignore[attr-defined]
     with pytest.raises(DatasetError, match=problem) as caught:
         open_dataset(f"{path}?depth=/camera/depth/image_raw&confidence={TOPIC}")
     assert f"{path}: topic {TOPIC}: " in str(caught.value)
 
 
-def test_a_topic_of_another_name_can_be_named(opened: Callable[..., Dataset]) -> None:
-    dataset = opened(lambda bag: confidence(bag, "/trust"), query="?confidence=/trust")
+def test_a_topic_of_another_name_can_be_named(make: Callable[..., Path]) -> None:
+    path = make(plain, lambda bag: confidence(bag, "/trust"))
+    dataset = open_dataset(f"{path}?confidence=/trust", color=False)
     np.testing.assert_allclose(dataset.read(1).sigma_m, expected(1), rtol=1e-6)
-    path = str(dataset.reader.path)  # type: ignore[attr-defined]
-    with pytest.raises(DatasetError, match=r"is of type nav_msgs/msg/Odometry, not"):
-        open_dataset(f"{path}?confidence=/odom")
-    with pytest.raises(DatasetError, match=r"there is no topic /nothing; topics of confidence: none"):
-        open_dataset(f"{path}?confidence=/nothing")
+    refused(f"{path}?confidence=/odom", "is of type nav_msgs/msg/Odometry, not")
+    refused(f"{path}?confidence=/nothing", "there is no topic /nothing; topics of confidence: none")
 
 
-def test_of_two_topics_one_must_be_chosen(opened: Callable[..., Dataset]) -> None:
+def test_of_two_topics_one_must_be_chosen(make: Callable[..., Path]) -> None:
     other = "/camera/confidence/image_raw"
-    dataset = opened(confidence, lambda bag: confidence(bag, other))
+    dataset = open_dataset(make(plain, confidence, lambda bag: confidence(bag, other)), color=False)
     assert dataset.read(0).sigma_m is None
     assert f"confidence: choose one with ?confidence={other} or ?confidence={TOPIC}" in dataset.notes
 
 
-def test_a_later_image_that_is_damaged_is_a_bad_frame(opened: Callable[..., Dataset]) -> None:
+def test_a_later_image_that_is_damaged_is_a_bad_frame(make: Callable[..., Path]) -> None:
     def write(bag: Bag) -> None:
         bag.image(TOPIC, stamp(0), FRAME, grades(0), "mono8")
         bag.image(TOPIC, stamp(1), FRAME, np.full(CAMERA.shape, 200, np.uint8), "mono8")
         bag.image(TOPIC, stamp(2), FRAME, grades(2)[1:], "mono8")
 
-    dataset = opened(write)
+    dataset = open_dataset(make(plain, write), color=False)
     assert dataset.read(0).sigma_m is not None
     with pytest.raises(
         FrameError, match=rf"^frame 000001: .*topic {TOPIC}: has values up to 200, which are no"

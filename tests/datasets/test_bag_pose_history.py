@@ -1,5 +1,6 @@
 """The poses of a bag as they were known at a time: paths that are sent again, and transforms that jump."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,12 @@ from inputs_bags import (
     COUNT,
     FRAME,
     START,
+    Bag,
     Kind,
     T_body_camera,
     images,
     mounted,
-    odometry,
+    plain,
     stamp,
     world_body,
     writing,
@@ -40,17 +42,16 @@ def assert_poses(found: ChangedPoses | None, wanted: dict[float, Pose]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
-def test_a_path_that_is_sent_again_corrects_earlier_poses(tmp_path: Path, kind: Kind) -> None:
-    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+def test_a_path_that_is_sent_again_corrects_earlier_poses(make: Callable[..., Path], kind: Kind) -> None:
     first = {stamp(i): world_body(i) for i in range(2)}
     last = {stamp(i): offset(0.0, 0.3, 0.1 * i) @ world_body(i) for i in range(4)}
-    with writing(path, kind) as bag:
-        images(bag)
-        odometry(bag)
-        mounted(bag)
+
+    def paths(bag: Bag) -> None:
         bag.path("/slam/path", stamp(0) - 0.5, "map", {})  # nothing known yet
         bag.path("/slam/path", stamp(1), "map", first)
         bag.path("/slam/path", stamp(3), "map", last)
+
+    path = make(plain, paths, kind=kind)
     source = open_pose_source(path)
     assert source.name == f"{path}: /slam/path"
     assert source.poll(float("-inf")) is None
@@ -94,12 +95,8 @@ def test_a_transform_that_jumps_moves_all_earlier_poses(tmp_path: Path) -> None:
     assert_poses(earth, wanted)
 
 
-def test_a_topic_of_single_poses_does_not_change(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        images(bag)
-        odometry(bag)
-        mounted(bag)
-    source = open_pose_source(tmp_path / "walk")
+def test_a_topic_of_single_poses_does_not_change(make: Callable[..., Path]) -> None:
+    source = open_pose_source(make(plain))
     assert_poses(source.poll(float("-inf")), {stamp(i): world_body(i) @ T_body_camera for i in range(COUNT)})
     assert source.poll(float("inf")) is None
 

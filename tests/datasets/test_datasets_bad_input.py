@@ -21,18 +21,10 @@ from datasets_recordings import (
 )
 from laser_logs import write_npz
 from point_clouds import write_ply
+from refusals import refusal, refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.errors import DatasetError, FrameError
-
-
-def refused(source: str | Path, **options: object) -> str:
-    """The text of the error on opening, which has to be one line and no FrameError."""
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(source, **options)  # type: ignore[arg-type]
-    assert not isinstance(caught.value, FrameError)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+from taichi_mrf.errors import FrameError
 
 
 @pytest.fixture
@@ -42,24 +34,16 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_no_such_folder(tmp_path: Path) -> None:
-    text = refused(tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in text
-    assert "synthetic:room" in text
+    refused(tmp_path / "nowhere", str(tmp_path / "nowhere"), "synthetic:room")
 
 
 def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
-    text = refused(tmp_path)
-    assert str(tmp_path) in text
-    assert "is empty" in text
-    for wanted in ("frame-NNNNNN.depth.png", "groundtruth.txt", ".log"):
-        assert wanted in text
+    refused(tmp_path, str(tmp_path), "is empty", "frame-NNNNNN.depth.png", "groundtruth.txt", ".log")
 
 
 def test_a_folder_of_something_else(tmp_path: Path) -> None:
     (tmp_path / "holiday.odt").write_bytes(b"")
-    text = refused(tmp_path)
-    assert str(tmp_path) in text
-    assert "frame-NNNNNN.depth.png" in text
+    refused(tmp_path, str(tmp_path), "frame-NNNNNN.depth.png")
 
 
 UNREAD = {
@@ -81,7 +65,7 @@ UNREAD = {
 def test_what_is_not_read_names_a_remedy(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"something")
     for source in (tmp_path / name, tmp_path):
-        assert UNREAD[name] in refused(source)
+        refused(source, UNREAD[name])
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
@@ -89,35 +73,37 @@ def test_what_is_not_read_names_a_remedy(tmp_path: Path, name: str) -> None:
 def test_only_colours(tmp_path: Path, suffix: str, place: str) -> None:
     for i, image in enumerate(Content(2).color):
         write_image(tmp_path / (f"{i}{suffix}" if place == "numbered" else f"{place}/view{i}{suffix}"), image)
-    assert "but no depth image (16-bit grey, or floats)" in refused(tmp_path)
+    refused(tmp_path, "but no depth image (16-bit grey, or floats)")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 def test_depth_images_of_other_names(tmp_path: Path, suffix: str) -> None:
     for i, image in enumerate(Content(2).depth):
         write_image(tmp_path / f"view{i}{suffix}", image)
-    assert f"of depth (view0{suffix}) in a layout that is not read" in refused(tmp_path)
-    assert f"is one image of depth (view0{suffix})" in refused(tmp_path / f"view0{suffix}")
+    refused(tmp_path, f"of depth (view0{suffix}) in a layout that is not read")
+    refused(tmp_path / f"view0{suffix}", f"is one image of depth (view0{suffix})")
 
 
 def test_poses_and_points_alone(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
-    assert f"with --poses {tmp_path / 'poses.csv'}" in refused(tmp_path / "poses.csv")
+    refused(tmp_path / "poses.csv", f"with --poses {tmp_path / 'poses.csv'}")
     cloud = write_ply(tmp_path / "cloud.ply", np.zeros((3, 3)))
-    assert "contains lidar point clouds without poses" in refused(cloud)
+    refused(cloud, "contains lidar point clouds without poses")
 
 
 def test_depth_of_another_kind_in_scannet_s_folders(tmp_path: Path) -> None:
     (tmp_path / "pose").mkdir()
     (tmp_path / "depth").mkdir()
     (tmp_path / "depth" / "0.exr").write_bytes(b"something")
-    assert "not read (0.exr)" in refused(tmp_path)
+    refused(tmp_path, "not read (0.exr)")
 
 
 def test_a_file_in_place_of_a_folder(folder: Path) -> None:
-    text = refused(folder / "camera.txt")
-    assert str(folder / "camera.txt") in text
-    assert "unsupported file type; for a recording of many files pass its folder" in text
+    refused(
+        folder / "camera.txt",
+        str(folder / "camera.txt"),
+        "unsupported file type; for a recording of many files pass its folder",
+    )
 
 
 @pytest.mark.parametrize("name", ["walk.log", "walk.log.gz", "scans.npz", "folder"])
@@ -131,7 +117,7 @@ def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) 
         write_npz(path / "scans.npz")
     else:
         path.write_bytes(gzip.compress(line) if name.endswith("gz") else line)
-    assert f"taichi-mrf laser {path} --out DIR" in refused(path)
+    refused(path, f"taichi-mrf laser {path} --out DIR")
 
 
 @pytest.mark.parametrize(
@@ -146,8 +132,8 @@ def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) 
 )
 def test_other_data_names_what_reads_it(tmp_path: Path, name: str, words: str) -> None:
     (tmp_path / name).write_bytes(b"something")
-    assert words in refused(tmp_path / name)
-    assert words in refused(tmp_path)
+    refused(tmp_path / name, words)
+    refused(tmp_path, words)
 
 
 @pytest.mark.parametrize("layout", ["NNNN.cam.info.txt", "pose/NNNN.txt"])
@@ -156,9 +142,7 @@ def test_poses_in_a_file_for_each_image_name_the_flags(tmp_path: Path, layout: s
     for number, image in enumerate(content.depth):
         write_image(tmp_path / f"{number:04d}.png", image)
         write_frame_text(tmp_path / layout.replace("NNNN", f"{number:04d}"))
-    text = refused(tmp_path)
-    assert "--camera 14.5,15,7.5,5.5 and --depth-scale" in text
-    assert "poses.txt" in text
+    refused(tmp_path, "--camera 14.5,15,7.5,5.5 and --depth-scale", "poses.txt")
     (tmp_path / "poses.txt").write_text("\n".join(row_of(np.eye(4)[:3]) for _ in content.depth))
     flags = {"intrinsics": (14.5, 15, 7.5, 5.5), "depth_scale": 1000.0}
     assert len(open_dataset(tmp_path, **flags)) == content.count  # type: ignore[arg-type]
@@ -168,7 +152,7 @@ def test_frames_with_a_text_file_each_name_the_pose_file(tmp_path: Path) -> None
     for number, image in enumerate(Content().depth):
         write_image(tmp_path / f"frame-{number:06d}.depth.png", image)
         write_frame_text(tmp_path / f"frame-{number:06d}.cam.info.txt")
-    assert "into frame-NNNNNN.pose.txt, and pass --camera 14.5,15,7.5,5.5" in refused(tmp_path)
+    refused(tmp_path, "into frame-NNNNNN.pose.txt, and pass --camera 14.5,15,7.5,5.5")
 
 
 def write_frame_text(path: Path) -> None:
@@ -183,17 +167,17 @@ def test_a_folder_of_recordings_names_them(folder: Path) -> None:
 
 
 def test_a_built_in_that_does_not_exist() -> None:
-    assert "did you mean 'synthetic:room'" in refused("synthetic:rooms")
-    assert "built-in sources are: synthetic:room" in refused("nonsense:whatever")
+    refused("synthetic:rooms", "did you mean 'synthetic:room'")
+    refused("nonsense:whatever", "built-in sources are: synthetic:room")
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_scale_that_is_none(folder: Path, scale: float) -> None:
-    assert "depth_scale" in refused(folder, depth_scale=scale)
+    refused(folder, "depth_scale", depth_scale=scale)
 
 
 def test_a_time_gap_that_is_none(folder: Path) -> None:
-    assert "max_time_gap" in refused(folder, max_time_gap=-0.1)
+    refused(folder, "max_time_gap", max_time_gap=-0.1)
 
 
 @pytest.mark.parametrize(
@@ -229,17 +213,14 @@ def test_a_camera_file_that_makes_no_sense(folder: Path, file: str, text: str, p
 def test_tum_without_poses(tmp_path: Path) -> None:
     write_tum(tmp_path, Content())
     (tmp_path / "groundtruth.txt").unlink()
-    assert str(tmp_path / "groundtruth.txt") in refused(tmp_path)
+    refused(tmp_path, str(tmp_path / "groundtruth.txt"))
 
 
 def test_tum_with_poses_of_another_day(tmp_path: Path) -> None:
     write_tum(tmp_path, Content())
     pose = stamped_line(17.0, np.eye(4))
     (tmp_path / "groundtruth.txt").write_text(pose)
-    text = refused(tmp_path)
-    assert "none of 5 depth images" in text
-    assert "within 0.02 s" in text
-    assert "17.000" in text
+    refused(tmp_path, "none of 5 depth images", "within 0.02 s", "17.000")
 
 
 @pytest.mark.parametrize(
@@ -257,25 +238,24 @@ def test_tum_with_poses_of_another_day(tmp_path: Path) -> None:
 def test_tum_lists_that_are_broken(tmp_path: Path, name: str, lines: str, problem: str) -> None:
     write_tum(tmp_path, Content())
     (tmp_path / name).write_text(lines)
-    text = refused(tmp_path)
-    assert str(tmp_path / name) in text
-    assert problem in text
+    refused(tmp_path, str(tmp_path / name), problem)
 
 
 def test_numbered_images_without_a_trajectory_or_with_two(tmp_path: Path) -> None:
     content = Content()
     write_numbered(tmp_path, content)
-    assert "without a trajectory" in refused(tmp_path)
+    refused(tmp_path, "without a trajectory")
     write_rows(tmp_path / "a.txt", content.poses)
     write_log(tmp_path / "b.log", content.poses)
-    assert "a.txt, b.log; keep one" in refused(tmp_path)
+    refused(tmp_path, "a.txt, b.log; keep one")
 
 
 def test_numbered_images_that_no_stamp_names(tmp_path: Path) -> None:
     write_numbered(tmp_path, Content())
     (tmp_path / "traj.txt").write_text(stamped_line(1305031102.5, np.eye(4)))
-    said = refused(tmp_path)
-    assert f"{tmp_path / 'traj.txt'}: its stamps are times, images are numbered, and there are 5 of" in said
+    refused(
+        tmp_path, f"{tmp_path / 'traj.txt'}: its stamps are times, images are numbered, and there are 5 of"
+    )
 
 
 # Frame 3 of a 7-Scenes recording is damaged in turn; the error has to name it and the file.
@@ -414,7 +394,9 @@ def test_a_trajectory_that_ends_early(tmp_path: Path, first: int) -> None:
     assert len(dataset) == 5
     for i in range(3):
         np.testing.assert_allclose(dataset.read(i).T_world_camera, content.poses[i], atol=1e-9)
-    with pytest.raises(FrameError) as caught:
+    with refusal(
+        FrameError,
+        f"frame {first + 4:05d}: {tmp_path / 'T_world_camera.txt'}: ",
+        "has no pose for this image",
+    ):
         dataset.read(4)
-    assert f"frame {first + 4:05d}: {tmp_path / 'T_world_camera.txt'}: " in str(caught.value)
-    assert "has no pose for this image" in str(caught.value)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 
 from taichi_mrf.datasets.trajectories import is_trajectory, read_matrix_file, read_trajectory, valid_poses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -104,11 +105,8 @@ GOOD = "0 1 2 3 0 0 0 1"
 )
 def test_a_broken_layout_names_file_and_line(tmp_path: Path, lines: list[str], problem: str) -> None:
     path = write(tmp_path / "poses.txt", *lines)
-    with pytest.raises(DatasetError) as caught:
+    with refusal(DatasetError, str(path), problem):
         read_trajectory(path)
-    assert str(path) in str(caught.value)
-    assert problem in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Bags of all three kinds, read back; what is chosen in them, what is left out, and what is said of bad
 ones."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from inputs_bags import (
     Bag,
     Kind,
     T_body_camera,
+    check_poses,
     images,
     mounted,
     odometry,
@@ -28,6 +28,7 @@ from inputs_bags import (
     world_body,
     writing,
 )
+from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.rvl import decode_rvl
@@ -36,31 +37,7 @@ from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
-
-
 Write = Callable[[Bag], None]
-
-
-@pytest.fixture
-def make(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a bag; returns its path."""
-
-    def write(*parts: Write, kind: Kind = "ros1", name: str = "walk") -> Path:
-        path = tmp_path / (f"{name}.bag" if kind == "ros1" else name)
-        with writing(path, kind) as bag:
-            for part in parts:
-                part(bag)
-        return path
-
-    return write
-
-
-def refused(source: object, **options: object) -> str:
-    """What is said of a source that cannot be opened, in one line."""
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(str(source), **options)  # type: ignore[arg-type]
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -135,9 +112,7 @@ def test_poses_out_of_the_tree(make: Callable[..., Path], kind: Kind) -> None:
             if base:
                 expected = look_at([0, 0, 0.1 * i], [1, 0, 0]) @ expected
             np.testing.assert_allclose(dataset.read(i).T_world_camera, expected, atol=1e-9)
-    assert "tf has no frame 'nowhere'; its frames: base_link, camera_depth" in refused(
-        f"{path}?frame=nowhere"
-    )
+    refused(f"{path}?frame=nowhere", "tf has no frame 'nowhere'; its frames: base_link, camera_depth")
 
 
 def test_the_frame_of_a_topic_can_be_left_for_another(make: Callable[..., Path]) -> None:
@@ -149,11 +124,11 @@ def test_the_frame_of_a_topic_can_be_left_for_another(make: Callable[..., Path])
 
 def test_a_pose_without_a_mounting_is_not_taken_for_the_cameras(make: Callable[..., Path]) -> None:
     path = make(images, odometry)
-    said = refused(path)
-    assert (
-        f"topic /odom: the poses are of {BODY}, and no transform from there to {FRAME} is in the bag" in said
+    refused(
+        path,
+        f"topic /odom: the poses are of {BODY}, and no transform from there to {FRAME} is in the bag",
+        f"?body={FRAME}",
     )
-    assert f"?body={FRAME}" in said
     named = make(images, lambda bag: odometry(bag, child="camera"), name="camera")
     for source, note in (
         (f"{path}?body={FRAME}", f", of {FRAME}"),
@@ -172,10 +147,7 @@ def test_a_mounting_that_is_sent_now_and_then_holds_all_the_time(make: Callable[
         for seconds in (0.2, 1.2):
             bag.tf("/tf", seconds, BODY, FRAME, T_body_camera)
 
-    dataset = open_dataset(make(write))
-    assert len(dataset) == COUNT
-    for i in range(COUNT):
-        np.testing.assert_allclose(dataset.read(i).T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
+    check_poses(open_dataset(make(write)))
 
 
 @pytest.mark.parametrize("frame", ["", "cam"])
@@ -188,9 +160,7 @@ def test_images_of_a_frame_that_tf_lacks_name_the_remedy(make: Callable[..., Pat
             bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
 
     path = make(write)
-    assert f"?optical=FRAME says which of tf's frames ({BODY}, {FRAME}, odom) is the sensor's" in refused(
-        path
-    )
+    refused(path, f"?optical=FRAME says which of tf's frames ({BODY}, {FRAME}, odom) is the sensor's")
     dataset = open_dataset(f"{path}?optical={FRAME}")
     np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1) @ T_body_camera, atol=1e-9)
 
@@ -204,7 +174,7 @@ def test_the_camera_of_another_frame_is_not_taken(make: Callable[..., Path]) -> 
         bag.camera_info("/camera/aligned/camera_info", "another_frame", other)
 
     path = make(write)
-    assert f"are of the frame {FRAME}, but the CameraInfo of /camera/aligned/camera_info" in refused(path)
+    refused(path, f"are of the frame {FRAME}, but the CameraInfo of /camera/aligned/camera_info")
     assert open_dataset(f"{path}?info=/camera/aligned/camera_info").camera == other
     both = make(write, lambda bag: bag.camera_info("/elsewhere/camera_info", FRAME, CAMERA), name="both")
     assert open_dataset(both).camera == CAMERA
@@ -229,7 +199,7 @@ def test_depth_of_the_plain_transport_is_found_as_png_and_refused_as_jpeg(make: 
 
     path = make(write)
     np.testing.assert_allclose(open_dataset(path).read(2).depth_m, steps(2) / 1000, rtol=1e-6)
-    assert "JPEG keeps 8 bits" in refused(f"{path}?depth=/cam/depth/jpg/compressed")
+    refused(f"{path}?depth=/cam/depth/jpg/compressed", "JPEG keeps 8 bits")
 
 
 @pytest.mark.parametrize(
@@ -265,7 +235,7 @@ def test_depth_in_an_unknown_format_is_refused_by_its_name(make: Callable[..., P
     def write(bag: Bag) -> None:
         bag.compressed_depth("/cam/depth/compressedDepth", stamp(0), FRAME, steps(0), "16UC1", packing)
 
-    assert f"topic /cam/depth/compressedDepth: encoding '16UC1; {packing}'" in refused(make(write, odometry))
+    refused(make(write, odometry), f"topic /cam/depth/compressedDepth: encoding '16UC1; {packing}'")
 
 
 @pytest.mark.parametrize("cut", [-1, 7, 12, 30])
@@ -323,10 +293,13 @@ def test_images_without_poses_are_left_out_and_counted(make: Callable[..., Path]
     assert any("4 of 5 images of /camera/depth/image_raw dropped" in note for note in dataset.notes)
     wider = open_dataset(path, max_time_gap=0.13)
     assert list(wider.frame_names) == ["000001", "000002", "000003"]
-    said = refused(path, max_time_gap=0.001)
-    assert "none of 5 images of /camera/depth/image_raw" in said
-    assert "within 0.001 s" in said
-    assert "/pose: 1600000001.080 to 1600000001.320 s" in said
+    refused(
+        path,
+        "none of 5 images of /camera/depth/image_raw",
+        "within 0.001 s",
+        "/pose: 1600000001.080 to 1600000001.320 s",
+        max_time_gap=0.001,
+    )
 
 
 def test_broken_poses_are_left_out_and_counted(make: Callable[..., Path]) -> None:
@@ -379,15 +352,12 @@ def test_a_lens_that_is_not_opencvs_is_named(make: Callable[..., Path]) -> None:
         odometry(bag, child=FRAME)
         bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant")
 
-    said = refused(make(write))
-    assert "/camera/depth/camera_info" in said
-    assert "'equidistant'" in said
-    assert "--undistort 0,0,0,0" in said
+    refused(make(write), "/camera/depth/camera_info", "'equidistant'", "--undistort 0,0,0,0")
 
 
 def test_without_a_camera_the_user_can_give_one(make: Callable[..., Path]) -> None:
     path = make(lambda bag: images(bag, info=False), odometry, mounted)
-    assert "--camera fx,fy,cx,cy" in refused(path)
+    refused(path, "--camera fx,fy,cx,cy")
     dataset = open_dataset(path, intrinsics=(14.0, 15.0, 7.5, 5.5))
     assert dataset.camera == CAMERA
 
@@ -402,7 +372,7 @@ def test_several_cameras_are_chosen_among(make: Callable[..., Path]) -> None:
         bag.camera_info("/camera/b/camera_info", FRAME, other)
 
     path = make(write)
-    assert "?info=/camera/a/camera_info or ?info=/camera/b/camera_info" in refused(path)
+    refused(path, "?info=/camera/a/camera_info or ?info=/camera/b/camera_info")
     assert open_dataset(f"{path}?info=/camera/b/camera_info").camera == other
 
 
@@ -442,8 +412,9 @@ def test_a_distorted_camera_that_changes_is_refused(make: Callable[..., Path]) -
             camera = PinholeCamera(16, 12, focal, focal, 7.5, 5.5)
             bag.camera_info("/camera/depth/camera_info", FRAME, camera, (0.1, 0, 0, 0, 0), stamp=stamp(i))
 
-    said = refused(make(write))
-    assert f"the camera changes at {START + stamp(1):.3f} s and its lens is distorted; --camera" in said
+    refused(
+        make(write), f"the camera changes at {START + stamp(1):.3f} s and its lens is distorted; --camera"
+    )
 
 
 def uncalibrated(bag: Bag) -> None:
@@ -499,10 +470,7 @@ BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
 def test_what_cannot_be_chosen_is_said_in_one_line(make: Callable[..., Path], problem: str) -> None:
     parts, query, words = BAD[problem]
     path = make(*parts)
-    said = refused(f"{path}{query}")
-    assert str(path) in said
-    for word in words:
-        assert word in said
+    refused(f"{path}{query}", str(path), *words)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -515,7 +483,7 @@ def test_a_bag_that_is_cut_short_is_named(make: Callable[..., Path], kind: Kind,
     said = refused(file)
     assert said.startswith(str(file))
     if kind != "ros1":
-        assert str(path) in refused(path)
+        refused(path, str(path))
 
 
 def test_a_damaged_image_is_a_broken_frame(make: Callable[..., Path]) -> None:
@@ -552,14 +520,6 @@ def test_messages_of_one_moment_are_kept_apart(make: Callable[..., Path]) -> Non
             )
 
 
-def test_without_its_library_one_line_says_what_to_install(
-    make: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = make(plain)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    assert "pip install 'taichi-mrf[ros]'" in refused(path)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("names", [("walk_0", "walk_1"), ("2026-11-25-10-00-00_0", "2026-11-25-10-00-03_1")])
 def test_the_files_of_a_split_recording_are_read_together(
@@ -583,10 +543,9 @@ def test_the_files_of_a_split_recording_are_read_together(
             (data,) = path.glob(f"*{suffix}")
             data.rename(folder / (name + suffix))
     dataset = open_dataset(folder)
-    assert len(dataset) == COUNT
     assert f"{names[0]}{suffix} to {names[1]}{suffix}: 2 files are read as one recording" in dataset.notes
+    check_poses(dataset)
     for i in range(COUNT):
-        np.testing.assert_allclose(dataset.read(i).T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
         np.testing.assert_allclose(dataset.read(i).depth_m, steps(i) / 1000, rtol=1e-6)
 
 
@@ -595,9 +554,11 @@ def test_numbered_bags_that_do_not_follow_each_other_are_several(tmp_path: Path)
     for number, later in enumerate((0.0, 60.0)):
         with writing(tmp_path / "runs" / f"run_{number}.bag", "ros1") as bag:
             bag.image("/camera/depth/image_raw", later, FRAME, steps(0), "16UC1")
-    said = refused(tmp_path / "runs")
-    assert "contains several recordings (run_1.bag begins 60.0 s after the end of the one before)" in said
-    assert "pass one of: run_0.bag, run_1.bag" in said
+    refused(
+        tmp_path / "runs",
+        "contains several recordings (run_1.bag begins 60.0 s after the end of the one before)",
+        "pass one of: run_0.bag, run_1.bag",
+    )
 
 
 def test_a_folder_of_bags_names_them(make: Callable[..., Path], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import small_room
 from console import taichi_mrf
-from datasets_recordings import Content, write_seven_scenes
+from datasets_recordings import CAMERA, Content, write_seven_scenes
 from inputs_bags import Bag, writing
 
 from taichi_mrf.cli.main import main
@@ -19,9 +19,6 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.summary import UNUSED_COLOR
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.geometry.poses import look_at
-from taichi_mrf.sensor.camera import PinholeCamera
-
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 
 
 def said(*arguments: str | Path) -> tuple[int, str, str]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import quaternion_of, stamped_line
+from datasets_recordings import stamped_line
 from hypothesis import given
 from hypothesis import strategies as st
 from inputs_frames import slerp
@@ -153,7 +153,3 @@ def test_the_body_is_what_the_camera_is_fixed_to(tree: TransformTree) -> None:
 def test_frames_in_a_circle_are_named() -> None:
     with pytest.raises(DatasetError, match="the frames a, b form a circle"):
         TransformTree({"a": ("b", A), "b": ("a", B)}).ancestors("a")
-
-
-def test_the_tests_own_quaternion_agrees_with_scipy() -> None:
-    np.testing.assert_allclose(Rotation.from_quat(quaternion_of(A[:3, :3])).as_matrix(), A[:3, :3], atol=1e-9)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line, write_log, write_rows
+from refusals import refused
 from stereo_rig import BASELINE, CAMERA, COUNT, pairs, pose, write
 
 from taichi_mrf.datasets import open_dataset
@@ -84,8 +85,7 @@ def test_stamps_in_a_file(tmp_path: Path) -> None:
     assert len(dataset) == 3
     np.testing.assert_allclose(dataset.read(2).T_world_camera, pose(2), atol=1e-6)
     (tmp_path / "times.txt").write_text("5.0")
-    with pytest.raises(DatasetError, match=r"times\.txt: contains 1 stamps for 3 pairs"):
-        open_dataset(path)
+    refused(path, "times.txt: contains 1 stamps for 3 pairs")
 
 
 @pytest.mark.parametrize(
@@ -116,20 +116,16 @@ def test_a_description_that_makes_no_sense(tmp_path: Path, changes: dict, said: 
 def test_a_file_that_is_no_description(tmp_path: Path, text: str) -> None:
     path = write(tmp_path, NAMES)
     path.write_text(text)
-    with pytest.raises(DatasetError, match=r"rig\.yaml"):
-        open_dataset(path)
+    refused(path, "rig.yaml")
 
 
 def test_poses_that_do_not_fit(tmp_path: Path) -> None:
     path = write(tmp_path, NAMES)
     write_rows(tmp_path / "poses.txt", [pose(0)])
-    with pytest.raises(DatasetError, match=r"poses\.txt: contains 1 poses for 3 stereo pairs"):
-        open_dataset(path)
+    refused(path, "poses.txt: contains 1 poses for 3 stereo pairs")
     (tmp_path / "poses.txt").write_text(stamped_line(0.0, pose(0)))
-    with pytest.raises(DatasetError, match=r"poses\.txt: has stamps, but the images have none"):
-        open_dataset(path)
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset(path, depth_scale=1000.0)
+    refused(path, "poses.txt: has stamps, but the images have none")
+    refused(path, "depth_scale", depth_scale=1000.0)
 
 
 def test_a_missing_image_is_one_frames(tmp_path: Path) -> None:

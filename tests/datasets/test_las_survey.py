@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line
-from point_clouds import las_head
+from point_clouds import LasFile, las_head
 
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import interpolate
@@ -23,24 +23,6 @@ TIMES = START + np.linspace(0.0, 0.29, COUNT)
 
 POINTS = np.random.default_rng(3).uniform(-6, 6, (COUNT, 3))
 SHUFFLED = np.random.default_rng(4).permutation(COUNT)
-
-
-class LasFile:
-    """A stand-in for an open file of laspy's and for its points."""
-
-    def __init__(self, points_m: np.ndarray, times: np.ndarray | None) -> None:
-        names = ["X", "Y", "Z", *([] if times is None else ["gps_time"])]
-        self.point_format = SimpleNamespace(id=0 if times is None else 1, dimension_names=names)
-        self.xyz, self.gps_time = points_m, times
-
-    def __enter__(self) -> "LasFile":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def read(self) -> "LasFile":
-        return self
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from laser_logs import ODOMETRY, flaser, robotlaser, write_npz
+from refusals import refusal
 
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.errors import DatasetError
@@ -204,9 +205,8 @@ def test_a_truncated_gzip_log_is_named_or_read_as_far_as_it_goes(tmp_path: Path,
     text = "\n".join(flaser(random.uniform(0, 9, 90), (0, 0, 0)) for _ in range(60))
     packed = gzip.compress(text.encode())
     path.write_bytes(packed[: int(kept * len(packed))])
-    with pytest.raises(DatasetError, match=r"cut\.log\.gz") as refused:
+    with refusal(DatasetError, "cut.log.gz", "truncated"):
         open_scans(path)
-    assert "truncated" in str(refused.value)
     read = open_scans(path, skip_bad_scans=True)
     assert 0 < len(read) < 60
     assert "truncated" in read.notes[0]
@@ -263,11 +263,8 @@ BROKEN_ARRAYS = {
 def test_a_broken_npz_file_is_named(tmp_path: Path, name: str) -> None:
     changes, words = BROKEN_ARRAYS[name]
     path = write_npz(tmp_path / "broken.npz", **changes)
-    with pytest.raises(DatasetError) as refused:
+    with refusal(DatasetError, str(path), words):
         open_scans(path, skip_bad_scans=True)
-    assert str(path) in str(refused.value)
-    assert words in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from datasets_recordings import row_of, stamped_line
 from point_clouds import Walk, write_pcd, write_ply, write_scans, write_velodyne
+from refusals import refused
 
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M, LidarScans, reach_of
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
@@ -139,8 +140,7 @@ def test_poses_of_another_file(tmp_path: Path) -> None:
     (tmp_path / "other.txt").write_text("\n".join(moved))
     dataset = open_dataset(f"{folder}?poses={tmp_path / 'other.txt'}")
     np.testing.assert_allclose(dataset.read(0).T_world_camera, WALK.poses[2], atol=1e-6)
-    with pytest.raises(DatasetError, match="unknown parameter 'pose'"):
-        open_dataset(f"{folder}?pose=x")
+    refused(f"{folder}?pose=x", "unknown parameter 'pose'")
 
 
 @pytest.mark.parametrize("write", [write_pcd, write_ply])
@@ -164,7 +164,7 @@ def test_rows_of_poses_go_by_the_order_of_names_or_by_their_numbers(tmp_path: Pa
     for frame, pose in zip(open_dataset(tmp_path), WALK.poses, strict=True):
         np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-6)
     (tmp_path / "poses.txt").write_text("\n".join([row_of(WALK.poses[0][:3])] * 5))
-    assert "go by the numbers of scans, but names such as a1.ply" in refused(tmp_path)
+    refused(tmp_path, "go by the numbers of scans, but names such as a1.ply")
     (tmp_path / "b1.ply").rename(tmp_path / "b4.ply")
     assert open_dataset(tmp_path).frame_names == ["a1", "c2", "b4"]
 
@@ -205,17 +205,10 @@ def test_scans_without_a_pose_are_dropped_and_counted(tmp_path: Path, kind: str)
     assert any("1 of 3 scans dropped" in note for note in dataset.notes)
 
 
-def refused(source: Path, **options: object) -> str:
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(source, **options)  # type: ignore[arg-type]
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def test_viewpoints_that_pcl_writes_by_default_are_no_poses(tmp_path: Path) -> None:
     for i, cloud in enumerate(WALK.clouds):
         write_pcd(tmp_path / f"{i}.pcd", cloud)
-    assert "the VIEWPOINT of all 3 clouds is the origin, so their poses are not known" in refused(tmp_path)
+    refused(tmp_path, "the VIEWPOINT of all 3 clouds is the origin, so their poses are not known")
 
 
 @pytest.mark.parametrize(
@@ -234,7 +227,7 @@ def test_viewpoints_that_pcl_writes_by_default_are_no_poses(tmp_path: Path) -> N
 def test_damaged_files_of_kitti_are_named(tmp_path: Path, name: str, text: str, problem: str) -> None:
     folder = velodyne(tmp_path / "walk")
     (folder / name).write_text(text) if text else (folder / name).unlink()
-    assert problem in refused(folder)
+    refused(folder, problem)
 
 
 @pytest.mark.parametrize(
@@ -251,23 +244,23 @@ def test_damaged_files_of_kitti_are_named(tmp_path: Path, name: str, text: str, 
 def test_damaged_poses_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], problem: str) -> None:
     folder = npz_scans(tmp_path / "walk")
     np.savez(folder / "poses.npz", **arrays)
-    assert problem in refused(folder)
+    refused(folder, problem)
 
 
 def test_as_many_stamped_poses_as_scans_or_names_that_are_times(tmp_path: Path) -> None:
     folder = plies_with_rows(tmp_path / "walk")
     lines = [stamped_line(float(i), pose) for i, pose in enumerate([*WALK.poses, WALK.poses[0]])]
     (folder / "poses.txt").write_text("\n".join(lines))
-    assert "contains 4 poses with stamps for 3 scans, whose names are no stamps" in refused(folder)
+    refused(folder, "contains 4 poses with stamps for 3 scans, whose names are no stamps")
     (folder / "poses2.txt").write_text("\n".join(lines))
-    assert "contains several files of poses, poses.txt, poses2.txt" in refused(folder)
+    refused(folder, "contains several files of poses, poses.txt, poses2.txt")
 
 
 @pytest.mark.parametrize(
     "option", [{"depth_scale": 1000.0}, {"intrinsics": (9.0, 9.0, 4.0, 4.0)}, {"image_scale": 0.5}]
 )
 def test_options_of_images_are_refused(tmp_path: Path, option: dict[str, object]) -> None:
-    assert "contains lidar scans" in refused(npz_scans(tmp_path / "walk"), **option)
+    refused(npz_scans(tmp_path / "walk"), "contains lidar scans", **option)
 
 
 def spoil(folder: Path, how: str) -> None:
@@ -313,9 +306,9 @@ def test_no_scan_that_can_be_read(tmp_path: Path) -> None:
     folder = npz_scans(tmp_path / "walk")
     for path in folder.glob("scan-*.npz"):
         np.savez(path, xyz=np.zeros((4, 3)))
-    said = refused(folder)
-    assert "no scan can be read: frame scan-000: " in said
-    assert "scan-000.npz: none of 4 points is a measurement" in said
+    refused(
+        folder, "no scan can be read: frame scan-000: ", "scan-000.npz: none of 4 points is a measurement"
+    )
 
 
 def test_what_is_known_of_a_lidar_takes_the_place_of_the_defaults(tmp_path: Path) -> None:

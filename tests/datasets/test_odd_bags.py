@@ -16,8 +16,8 @@ from inputs_bags import (
     FRAME,
     START,
     Bag,
-    Kind,
     T_body_camera,
+    check_poses,
     images,
     mounted,
     odometry,
@@ -28,27 +28,12 @@ from inputs_bags import (
     writing,
 )
 
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
 
 T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])
 TOPIC = "/camera/depth/image_raw"
-
-
-def write(tmp_path: Path, content: Callable[[Bag], None], kind: Kind = "mcap", name: str = "walk") -> Path:
-    path = tmp_path / (f"{name}.bag" if kind == "ros1" else name)
-    with writing(path, kind) as bag:
-        content(bag)
-    return path
-
-
-def check_poses(dataset: Dataset, T_fixed: Pose | None = None, mount: Pose | None = None) -> None:
-    mount = T_body_camera if mount is None else mount
-    assert len(dataset) == COUNT
-    for i, frame in enumerate(dataset):
-        T = (np.eye(4) if T_fixed is None else T_fixed) @ world_body(i) @ mount
-        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-6)
 
 
 def in_map(bag: Bag) -> None:
@@ -82,22 +67,22 @@ def localised(bag: Bag) -> None:
 
 @pytest.mark.parametrize("poses", [moving_tf, by_odometry, by_both, localised])
 def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
-    tmp_path: Path, poses: Callable[[Bag], None]
+    make: Callable[..., Path], poses: Callable[[Bag], None]
 ) -> None:
-    dataset = open_dataset(write(tmp_path, lambda bag: (in_map(bag), poses(bag))))
+    dataset = open_dataset(make(in_map, poses, kind="mcap"))
     check_poses(dataset, T_MAP_ODOM, np.eye(4))
     ranges = np.sort(dataset.read(0).depth_m[dataset.read(0).depth_m > 0])
     expected = np.sort(np.linalg.norm(bag_clouds.points(0), axis=-1)[~bag_clouds.LOST])
     np.testing.assert_allclose(ranges, expected, atol=1e-4)
 
 
-def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(tmp_path: Path) -> None:
+def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(make: Callable[..., Path]) -> None:
     def content(bag: Bag) -> None:
         in_map(bag)
         moving_tf(bag)
         moving_tf(bag, T=np.eye(4), child="other")
 
-    path = write(tmp_path, content)
+    path = make(content, kind="mcap")
     with pytest.raises(DatasetError, match=rf"are of map, in which tf's frames {BODY}, other move.*\?body="):
         open_dataset(path)
     check_poses(open_dataset(f"{path}?body={BODY}"), T_MAP_ODOM, np.eye(4))
@@ -147,8 +132,8 @@ def test_mcap_files_of_any_profile_are_read(tmp_path: Path, profile: str, encodi
     np.testing.assert_allclose(dataset.read(2).depth_m, steps(2) / np.float32(1000))
 
 
-def test_topics_of_another_encoding_in_the_metadata_are_passed_over(tmp_path: Path) -> None:
-    path = write(tmp_path, lambda bag: (plain(bag), odometry(bag, "/other")))
+def test_topics_of_another_encoding_in_the_metadata_are_passed_over(make: Callable[..., Path]) -> None:
+    path = make(plain, lambda bag: odometry(bag, "/other"), kind="mcap")
     text = (path / "metadata.yaml").read_text()
     before, mark, after = text.rpartition("serialization_format: cdr")
     assert mark
@@ -156,7 +141,9 @@ def test_topics_of_another_encoding_in_the_metadata_are_passed_over(tmp_path: Pa
     check_poses(open_dataset(f"{path}?pose=/odom"))
 
 
-def test_parts_of_a_recording_whose_first_files_are_gone_are_read_together(tmp_path: Path) -> None:
+def test_parts_of_a_recording_whose_first_files_are_gone_are_read_together(
+    make: Callable[..., Path], tmp_path: Path
+) -> None:
     for number, part in ((3, range(2)), (4, range(2, COUNT))):
 
         def content(bag: Bag, part: range = part) -> None:
@@ -165,7 +152,7 @@ def test_parts_of_a_recording_whose_first_files_are_gone_are_read_together(tmp_p
                 bag.image(TOPIC, stamp(i), FRAME, steps(i), "16UC1")
                 bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
 
-        folder = write(tmp_path, content, "sqlite", f"part{number}")
+        folder = make(content, kind="sqlite", name=f"part{number}")
         (tmp_path / "walk").mkdir(exist_ok=True)
         shutil.move(next(folder.glob("*.db3")), tmp_path / "walk" / f"walk_{number}.db3")
     check_poses(open_dataset(tmp_path / "walk", intrinsics=(14.0, 15.0, 7.5, 5.5)))
@@ -196,9 +183,9 @@ def pointer(path: Path) -> Path:
     ],
 )
 def test_a_bag_that_cannot_be_opened_says_why(
-    tmp_path: Path, damage: Callable[[Path], Path], words: str
+    make: Callable[..., Path], damage: Callable[[Path], Path], words: str
 ) -> None:
-    path = damage(write(tmp_path, plain))
+    path = damage(make(plain, kind="mcap"))
     with pytest.raises(DatasetError, match=words) as caught:
         open_dataset(path)
     assert ("cut short" in str(caught.value)) == (damage is cut)
@@ -245,18 +232,18 @@ def path_of(bag: Bag) -> None:
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_missing_is_named_with_the_remedy(tmp_path: Path, case: str) -> None:
+def test_what_is_missing_is_named_with_the_remedy(make: Callable[..., Path], case: str) -> None:
     content, words = REFUSED[case]
     with pytest.raises(DatasetError, match=words):
-        open_dataset(write(tmp_path, content))
+        open_dataset(make(content, kind="mcap"))
 
 
-def test_the_last_message_of_a_path_has_the_poses(tmp_path: Path) -> None:
-    path = write(tmp_path, lambda bag: (images(bag), path_of(bag)))
+def test_the_last_message_of_a_path_has_the_poses(make: Callable[..., Path]) -> None:
+    path = make(images, path_of, kind="mcap")
     check_poses(open_dataset(f"{path}?body={FRAME}"))
 
 
-def test_a_mounting_that_is_no_pose_is_named(tmp_path: Path) -> None:
+def test_a_mounting_that_is_no_pose_is_named(make: Callable[..., Path]) -> None:
     def content(bag: Bag) -> None:
         images(bag)
         odometry(bag)
@@ -271,28 +258,28 @@ def test_a_mounting_that_is_no_pose_is_named(tmp_path: Path) -> None:
         bag.send("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, transforms=[transform])
 
     with pytest.raises(DatasetError, match=rf"transform of {FRAME} in {BODY} is none.*quaternion of 0"):
-        open_dataset(write(tmp_path, content))
+        open_dataset(make(content, kind="mcap"))
 
 
-def test_signed_millimetres_and_the_largest_value(tmp_path: Path) -> None:
+def test_signed_millimetres_and_the_largest_value(make: Callable[..., Path]) -> None:
     def image(i: int) -> np.ndarray:
         depth = steps(i).astype(np.int16)
         depth[:2], depth[2] = np.iinfo(np.int16).max, -5
         return depth
 
-    dataset = open_dataset(write(tmp_path, lambda bag: but(bag, image, "16SC1")))
+    dataset = open_dataset(make(lambda bag: but(bag, image, "16SC1"), kind="mcap"))
     assert any("17% of the pixels of 3 frames looked at have the largest number" in n for n in dataset.notes)
     expected = np.where(np.arange(12)[:, None] < 3, 0, steps(1)) / np.float32(1000)
     np.testing.assert_allclose(dataset.read(1).depth_m, expected)
 
 
-def test_where_stamps_stand_still_the_times_of_recording_count(tmp_path: Path) -> None:
+def test_where_stamps_stand_still_the_times_of_recording_count(make: Callable[..., Path]) -> None:
     def content(bag: Bag) -> None:
         header, bag.latency = bag.header, 0.0
         bag.header = lambda at, frame: header(7.0 if frame == FRAME else at, frame)  # type: ignore[method-assign]
         plain(bag)
 
-    dataset = open_dataset(write(tmp_path, content))
+    dataset = open_dataset(make(content, kind="mcap"))
     assert f"the stamps of {TOPIC} stand still: the times of recording are taken" in dataset.notes
     check_poses(dataset)
 
@@ -311,7 +298,7 @@ def seen(i: int) -> np.ndarray:
 @pytest.mark.parametrize("source", ["tf", "odometry", "pose"])
 @pytest.mark.parametrize("is_body", [True, False])
 def test_poses_of_a_camera_link_are_turned_if_images_agree_so(
-    tmp_path: Path, source: str, is_body: bool
+    make: Callable[..., Path], source: str, is_body: bool
 ) -> None:
     frame = FRAME if source == "pose" else "camera_link"
 
@@ -327,7 +314,7 @@ def test_poses_of_a_camera_link_are_turned_if_images_agree_so(
             else:
                 bag.pose_stamped("/camera/pose", stamp(i), "odom", T_link)
 
-    dataset = open_dataset(write(tmp_path, content))
+    dataset = open_dataset(make(content, kind="mcap"))
     for frame_read, T in zip(dataset, EYES, strict=True):
         np.testing.assert_allclose(frame_read.T_world_camera, T, atol=1e-6)
     assert any("of a body, x ahead and z up" in note for note in dataset.notes) == is_body

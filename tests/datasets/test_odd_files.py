@@ -12,7 +12,8 @@ import lz4.frame
 import numpy as np
 import pytest
 from datasets_recordings import Content, write_image, write_seven_scenes
-from inputs_bags import Bag, plain, writing
+from inputs_bags import Bag, plain, write_bag
+from refusals import refused
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import StoragePlugin, storage_mcap
 from rosbags.rosbag2 import Writer as Writer2
@@ -88,13 +89,11 @@ def test_a_fifo_in_a_recording_is_a_bad_frame(tmp_path: Path, file: str) -> None
 
 @pytest.mark.skipif(os.name == "nt", reason="FIFOs are a POSIX feature")
 def test_a_fifo_in_a_bag_is_refused(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        plain(bag)
-    file = next((tmp_path / "walk").glob("*.mcap"))
+    path = write_bag(tmp_path, plain, kind="mcap")
+    file = next(path.glob("*.mcap"))
     file.unlink()
     os.mkfifo(file)
-    with pytest.raises(DatasetError, match=r"\.mcap: cannot be read: it is a FIFO"):
-        open_dataset(tmp_path / "walk")
+    refused(tmp_path / "walk", ".mcap: cannot be read: it is a FIFO")
 
 
 def png_of_zeros(width: int, height: int) -> bytes:
@@ -265,13 +264,13 @@ def test_unpackers_are_bounded_and_give_what_is_packed(codec: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("codec", "claimed"), [("bz2", ()), ("zstd", (1000,)), ("zstd", (300_000_000,)), ("lz4", (1000,))]
+    ("codec", "claimed"), [("bz2", ()), ("zstd", (1000,)), ("zstd", (100_000_000,)), ("lz4", (1000,))]
 )
 def test_nothing_is_unpacked_beyond_what_is_claimed_or_likely(codec: str, claimed: tuple[int, ...]) -> None:
     bound_unpacking()
     table = storage_mcap.DECOMPRESSORS if claimed else rosbag1.decompressors
     with pytest.raises(ValueError, match="unpack to more than it may"):
-        table[codec](packed_zeros(codec, 300_000_000), *claimed)
+        table[codec](packed_zeros(codec, 100_000_000), *claimed)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from console import FAST, mapped, report_of
 
 from taichi_mrf.datasets.entries import FORMATS
 from taichi_mrf.datasets.plugs import GROUP, OWN, plugs
@@ -96,13 +97,18 @@ def test_the_documented_plug_is_read_and_broken_ones_are_named(tmp_path: Path, r
         assert text in refused
 
 
-def test_a_plugs_recording_is_mapped(tmp_path: Path, repository: Path) -> None:
+def test_a_plugs_recording_is_mapped(
+    tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     site, folder = tmp_path / "site", walk(tmp_path / "walk")
     installed(site, "walk", "walk", "walk:FORMAT", documented(repository))
-    words = ["-m", "taichi_mrf", "map", str(folder), "--out", str(tmp_path / "out"), "--runtime.arch", "cpu"]
-    done = run(site, repository, *words)
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    monkeypatch.syspath_prepend(site)
+    plugs.cache_clear()
+    try:
+        mapped(folder, "--out", tmp_path / "out", *FAST)
+    finally:
+        plugs.cache_clear()
+    assert report_of(tmp_path / "out")["frames"]
 
 
 @pytest.mark.skipif(tomllib is None, reason="Python 3.10 reads no TOML")

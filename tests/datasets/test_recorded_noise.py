@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_street import BASELINE, write_kitti
 from sliding_camera import CAMERA, SlidingCamera
+from stereo_rig import BASELINE, write_kitti
 
 from taichi_mrf.config.inference import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from datasets_recordings import Content, arrays, write_npz, write_stray
 from point_clouds import Walk, write_scans
+from refusals import refused
 
 from taichi_mrf.config.schema import Config, KeyframeConfig, SensorConfig
 from taichi_mrf.datasets import open_dataset
@@ -20,7 +21,7 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.submaps.job import Sequence as Recorded
+from taichi_mrf.submaps.plan import SourceFrames
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.system import runtime
 
@@ -130,15 +131,8 @@ def test_submaps_choose_keyframes_for_each_sensor_too(robot: Path) -> None:
     active = runtime.active()
     assert active is not None
     config = replace(config, runtime=replace(config.runtime, arch=active))
-    keyframes, _ = find_keyframes(Recorded(str(robot), {}), config, InTurn())  # type: ignore[arg-type]
+    keyframes, _ = find_keyframes(SourceFrames(str(robot), {}), config, InTurn())  # type: ignore[arg-type]
     assert [keyframe.index for keyframe in keyframes] == [0, 1]
-
-
-def refused(path: Path, **options: object) -> str:
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(path, **options)  # type: ignore[arg-type]
-    assert str(path) in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -165,8 +159,8 @@ def test_what_is_wrong_with_the_file_is_named(robot: Path, text: str, problem: s
 
 
 def test_options_belong_to_the_sensors(robot: Path) -> None:
-    assert "reading: {...}" in refused(robot, image_scale=0.5)
-    assert "cannot be found by tracking" in refused(robot, track=True)
+    refused(robot, str(robot), "reading: {...}", image_scale=0.5)
+    refused(robot, str(robot), "cannot be found by tracking", track=True)
 
 
 def test_a_broken_frame_is_named_by_its_sensor(robot: Path) -> None:

@@ -20,7 +20,6 @@ from taichi_mrf.datasets.synthetic.corridor import (
     waypoints,
 )
 from taichi_mrf.datasets.synthetic.room_furniture import HEIGHT, LENGTH, WALL, WIDTH
-from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import as_pose, tangent_norms
 from taichi_mrf.mapping.selection import is_held_out
 
@@ -106,22 +105,6 @@ def test_frames_are_the_same_each_time_and_differ_by_seed(backend: str) -> None:
     assert (opened(SMALL + "&seed=1").read(7).depth_m != once.depth_m).any()
     assert once.color is not None
     assert len(np.unique(once.color.reshape(-1, 3), axis=0)) > 100
-
-
-@pytest.mark.parametrize(
-    ("query", "problem"),
-    [("room=3", "did you mean 'rooms'?"), ("rooms=0", "rooms must be at least 1"), ("frames=0", "frames")],
-)
-def test_wrong_options(query: str, problem: str) -> None:
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(f"synthetic:corridor?{query}")
-    assert str(caught.value).startswith("synthetic:corridor")
-    assert problem in str(caught.value)
-
-
-def test_a_depth_scale_has_no_meaning_here() -> None:
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset("synthetic:corridor", depth_scale=5000)
 
 
 def test_info_tells_of_it(backend: str, capsys: pytest.CaptureFixture[str]) -> None:

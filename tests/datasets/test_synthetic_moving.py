@@ -20,7 +20,6 @@ from taichi_mrf.datasets.synthetic.moving_scene import (
     way,
 )
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
-from taichi_mrf.errors import DatasetError
 
 VARIANTS = range(4)
 number = st.floats(-2, 2)
@@ -151,5 +150,3 @@ def test_a_room_without_motion_is_the_furnished_room() -> None:
     assert room.moving_scene is None
     assert room.scene_at(3) is room.scene
     assert room.stamp_at(5) == 1.0
-    with pytest.raises(DatasetError, match="moving must be one of none, things, door, walker"):
-        open_dataset("synthetic:room?moving=cat")

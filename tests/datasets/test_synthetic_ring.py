@@ -7,7 +7,6 @@ import pytest
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.ring import OVERLAP_M, SmoothWay, SyntheticRing
-from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import as_pose, tangent_norms
 
 SMALL = "synthetic:ring?frames=60&width=80&height=60&noise=none"
@@ -62,14 +61,3 @@ def test_it_is_closed_and_bare_walls_are_seen_through_nothing(backend: str) -> N
         points = (bare.camera.rays() * seen[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
         assert (seen > 0).all()
         assert np.abs(bare.signed_distance(points)).max() < 2e-3
-
-
-@pytest.mark.parametrize(
-    ("query", "words"),
-    [("length=20", "length must be at least 24"), ("wall=bare", "walls"), ("walls=no", "no")],
-)
-def test_wrong_options_are_named(query: str, words: str) -> None:
-    with pytest.raises(DatasetError, match=words):
-        open_dataset(f"synthetic:ring?{query}")
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset("synthetic:ring", depth_scale=5000)

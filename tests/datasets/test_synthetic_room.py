@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
@@ -17,7 +18,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import (
     camera_pose,
     room_scene,
 )
-from taichi_mrf.errors import BackendError, DatasetError
+from taichi_mrf.errors import BackendError
 from taichi_mrf.geometry.poses import as_pose, look_at, tangent_norms
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
@@ -260,29 +261,33 @@ def test_options_and_defaults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("query", "problem"),
+    ("source", "problem"),
     [
-        ("frame=3", "unknown parameter 'frame'; did you mean 'frames'?"),
-        ("frames=many", "frames must be of type int"),
-        ("frames=", "frames must be of type int"),
-        ("frames=0", "frames must be at least 1"),
-        ("width=-640", "width must be at least"),
-        ("noise=some", "noise must be one of kinect, none"),
-        ("frames", "name=value"),
-        ("frames=[", "name=value"),
+        ("room?frame=3", "unknown parameter 'frame'; did you mean 'frames'?"),
+        ("room?frames=many", "frames must be of type int"),
+        ("room?frames=", "frames must be of type int"),
+        ("room?frames=0", "frames must be at least 1"),
+        ("room?width=-640", "width must be at least"),
+        ("room?noise=some", "noise must be one of kinect, none"),
+        ("room?frames", "name=value"),
+        ("room?frames=[", "name=value"),
+        ("room?moving=cat", "moving must be one of none, things, door, walker"),
+        ("corridor?room=3", "did you mean 'rooms'?"),
+        ("corridor?rooms=0", "rooms must be at least 1"),
+        ("corridor?frames=0", "frames"),
+        ("ring?length=20", "length must be at least 24"),
+        ("ring?wall=bare", "walls"),
+        ("ring?walls=no", "no"),
     ],
 )
-def test_wrong_options(query: str, problem: str) -> None:
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(f"synthetic:room?{query}")
-    assert str(caught.value).startswith("synthetic:room")
-    assert problem in str(caught.value)
-    assert "\n" not in str(caught.value)
+def test_wrong_options_are_named(source: str, problem: str) -> None:
+    source = f"synthetic:{source}"
+    assert refused(source, problem).startswith(source.partition("?")[0])
 
 
-def test_a_depth_scale_has_no_meaning_here() -> None:
-    with pytest.raises(DatasetError, match="depth_scale"):
-        open_dataset("synthetic:room", depth_scale=5000)
+@pytest.mark.parametrize("name", ["room", "corridor", "ring"])
+def test_a_depth_scale_has_no_meaning_here(name: str) -> None:
+    refused(f"synthetic:{name}", "depth_scale", depth_scale=5000.0)
 
 
 def test_rendering_before_taichi_runs_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """data/tiny_room is small, is what its script makes, and is the room that it claims to be."""
 
-import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -13,15 +12,15 @@ from taichi_mrf.datasets.synthetic.room_furniture import room_scene
 
 
 @pytest.fixture(scope="module")
-def remade(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def remade(one_backend: str, repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sequence as the script makes it here."""
-    folder = tmp_path_factory.mktemp("data") / "tiny_room"
-    subprocess.run(
-        [sys.executable, repository / "data" / "make_tiny_sequence.py", folder],
-        check=True,
-        capture_output=True,
-        env={**os.environ, "PYTHONPATH": str(repository)},
+    script, folder = (
+        repository / "data" / "make_tiny_sequence.py",
+        tmp_path_factory.mktemp("data") / "tiny_room",
     )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(script), str(folder)])
+        runpy.run_path(str(script), run_name="__main__")
     return folder
 
 

@@ -12,7 +12,7 @@ import pytest
 from broken_recordings import BREAKS, FLAGS, LATE_S, of_frames, of_poses
 from console import carry_out
 from datasets_recordings import stamped_line, write_image
-from kitti_street import write_kitti
+from stereo_rig import write_kitti
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset

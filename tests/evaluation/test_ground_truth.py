@@ -69,7 +69,7 @@ def met_by(triangle: NDArray[np.float64], larger: float) -> Cells:
     return met
 
 
-coordinate = st.floats(-6, 6, allow_subnormal=False)
+coordinate = st.floats(-4, 4, allow_subnormal=False)
 corner = st.tuples(coordinate, coordinate, coordinate)
 
 

@@ -114,8 +114,11 @@ def _notices(folder: Path, m: VoxelMap) -> None:
         assert 0.001 < np.mean(picture < 128) < 0.2, f"{path.name} holds a line of text and nothing else"
 
 
+EMPTY = VoxelMap(np.zeros((0, 3)), np.zeros(0, np.float32), {})
+
+
 def test_empty_map_says_so(tmp_path: Path) -> None:
-    _notices(tmp_path, VoxelMap(np.zeros((0, 3)), np.zeros(0, np.float32), {}))
+    _notices(tmp_path, EMPTY)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -126,9 +129,9 @@ def test_few_voxels_and_no_keyframes(tmp_path: Path, count: int) -> None:
         assert np.mean(picture < 250) > 0.005
 
 
-def test_missing_folder(room: VoxelMap, tmp_path: Path) -> None:
+def test_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match=r"\.png: cannot be written"):
-        write_pictures(tmp_path / "absent", room, [])
+        write_pictures(tmp_path / "absent", EMPTY, [])
 
 
 def _titles(m: VoxelMap, held_out: Sequence[Frame]) -> list[str]:

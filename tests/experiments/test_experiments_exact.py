@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from small_scenes import experiment, make_data
+from small_scenes import experiment
 
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.tables import Table
@@ -11,17 +11,10 @@ from taichi_mrf.experiments.exact import MAPS, PER_RAY, room_scene, run_exact
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.scenes import Scene, kitchen_scene
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.system import runtime
 
 SIZE = 0.2
 VIEWS = 4
 REFERENCE = "each ray, sum-product"
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    runtime.init("cpu")  # its kernels have tests of their own on every backend
-    return make_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,12 @@
 """Figures 7 and 10 on a small room: the ray and the scores that are shown, and what another image costs."""
 
 import csv
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from small_scenes import COFFIN_VIEWS, HOUSE_VIEWS, experiment, make_data
+from small_scenes import COFFIN_VIEWS, HOUSE_VIEWS, experiment
 
 from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.errors import ConfigError
@@ -20,11 +19,6 @@ from taichi_mrf.methods.mrf.map import MRFMap
 
 HELD_OUT = COFFIN_VIEWS - 1
 """The paper's view 4 is not among the small room's, so it is the last."""
-
-
-@pytest.fixture(scope="module")
-def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_data(tmp_path_factory.mktemp("data"))
 
 
 def test_fig7_shows_the_held_out_view(data: Path, tmp_path: Path) -> None:
@@ -110,10 +104,3 @@ def test_fig10_times_every_image(data: Path, tmp_path: Path) -> None:
     assert [row[1] for row in limited.rows] == [1, 2]
     with open(tmp_path / "limited" / "fig10.csv", newline="") as file:
         assert [float(row["OctoMap"]) for row in csv.DictReader(file)] == [row[4] for row in limited.rows]
-
-
-def test_fig10_says_what_brings_octomap(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoctomap", None)
-    with pytest.raises(ConfigError, match=r"OctoMap: pip install 'taichi-mrf\[bench\]'") as caught:
-        run_fig10(experiment(data, tmp_path, voxel_sizes=(0.2,)))
-    assert "\n" not in str(caught.value)

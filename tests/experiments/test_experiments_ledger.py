@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refusal
 
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.experiments.ledger import Ledger
@@ -106,9 +107,8 @@ def test_a_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     (tmp_path / "folder.jsonl").mkdir()
     (tmp_path / "binary.jsonl").write_bytes(b"\xff\xfe\x00")
     for name in ("folder.jsonl", "binary.jsonl"):
-        with pytest.raises(MapFileError, match=rf"{name}: cannot be read") as caught:
+        with refusal(MapFileError, f"{name}: cannot be read"):
             Ledger(tmp_path / name, MADE_WITH)
-        assert "\n" not in str(caught.value)
     with pytest.raises(MapFileError, match=r"no/l\.jsonl: cannot be written"):
         Ledger(tmp_path / "no" / "l.jsonl", MADE_WITH)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import CAMERA, make_data
+from small_scenes import CAMERA
 
 from taichi_mrf import PinholeCamera, PolynomialNoise
 from taichi_mrf.benchmark.bench import octomap_available
@@ -23,7 +23,6 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 
 WALL_M = 1.93
 VOXEL_M = 0.1
-NO_POINTS = KnownPoints(np.zeros((0, 3)), np.zeros(0, bool))
 
 needs_octomap = pytest.mark.skipif(
     not octomap_available(), reason="pyoctomap (the extra bench) is not installed"
@@ -169,8 +168,9 @@ def test_settings_have_names_of_their_own_and_one_standard() -> None:
             assert not (lidar and system.images_only)
 
 
-def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = make_data(tmp_path)
+def test_the_comparison_goes_on_where_it_was(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few = [
         System("MRFMap", our_maps.MrfPeer, [Knob("coarse", 2), Knob("all", standard=True)]),
         System("log-odds", our_maps.log_odds, [Knob("all", standard=True)]),

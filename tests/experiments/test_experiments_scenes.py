@@ -1,6 +1,7 @@
 """The scenes of the experiments: reading them, their noise, what counts, and what a broken one says."""
 
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import small_scenes
-from small_scenes import CAMERA, COFFIN_VIEWS, FAR_WALL, HOUSE_VIEWS, KITCHEN_VIEWS, make_data, noise_tables
+from small_scenes import CAMERA, COFFIN_VIEWS, FAR_WALL, HOUSE_VIEWS, KITCHEN_VIEWS, noise_tables
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import DatasetError, FrameError
@@ -31,15 +32,10 @@ from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_mode
 Damage = Callable[[Path], object]
 
 
-@pytest.fixture(scope="module")
-def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_data(tmp_path_factory.mktemp("data"))
-
-
 @pytest.fixture
-def spare(one_backend: str, tmp_path: Path) -> Path:
+def spare(data: Path, tmp_path: Path) -> Path:
     """A data folder to be damaged."""
-    return make_data(tmp_path)
+    return shutil.copytree(data, tmp_path, dirs_exist_ok=True)
 
 
 def points(view: SceneView) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_scenes import COFFIN_VIEWS, experiment, make_data
+from small_scenes import COFFIN_VIEWS, experiment
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import TOLERANCES, judge_view
@@ -22,7 +22,6 @@ from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.view import View
-from taichi_mrf.system import runtime
 from taichi_mrf.voxels.traversal import FAR
 
 SIZES = (0.2, 0.05)
@@ -44,13 +43,6 @@ ROWS = [
 ]
 NAMES = ("table1", "table1_noise_seeds", "table1_log_odds_weights")
 Row = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Made on the CPU: the other backends' runs leave these tests out, to which they would add only time."""
-    runtime.init("cpu")
-    return make_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.polynomial.polynomial import polyval
-from small_scenes import HOUSE_VIEWS, KITCHEN_VIEWS, experiment, make_data
+from small_scenes import HOUSE_VIEWS, KITCHEN_VIEWS, experiment
 
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -39,11 +39,6 @@ OCCUPANCY = [
     "precision", "recall", "ROC area", "Brier score", "expected calibration error", "occupied",
     "judged voxels",
 ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +147,11 @@ def test_table2_goes_on_where_it_was(second: tuple, data: Path) -> None:
     assert lines == run.ledger.path.read_text().splitlines(keepends=True)
 
 
-def test_table2_without_held_out_views(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table2_without_held_out_views_and_a_ray_caster(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("embreex", "embreex.rtcore_scene", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.setattr(table2, "THRESHOLD", 0.1)
     run = experiment(data, tmp_path, voxel_sizes=(0.2,), limit=2)
     tables, _ = run_table2(run)
@@ -165,14 +164,6 @@ def test_table2_says_what_reads_meshes(data: Path, tmp_path: Path, monkeypatch: 
     with pytest.raises(DatasetError, match=r"trimesh.*pip install 'taichi-mrf\[mesh\]'") as caught:
         run_table2(experiment(data, tmp_path, voxel_sizes=(0.2,)))
     assert "\n" not in str(caught.value)
-
-
-def test_table2_needs_no_ray_caster(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("embreex", "embreex.rtcore_scene", "embreex.mesh_construction"):
-        monkeypatch.setitem(sys.modules, module, None)
-    run = experiment(data, tmp_path, voxel_sizes=(0.2,), limit=2)
-    tables, _ = run_table2(run)
-    assert row_of(tables[0], "MRFMap")["views"] == 2
 
 
 def test_table2_names_a_missing_mesh(data: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from taichi_mrf.errors import MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_store import ChunkStore
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.voxels.layers import LOG_ODDS, BrickValues
 
 zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 
@@ -43,8 +44,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = ChunkStore.create(
         path, StoreHeader.of(Config(), -2.0, -8.9, 0.05), np.array([CHUNK, (0, 1, 0)], np.int32)
     )
-    for chunk in store.chunks:
-        store.write(chunk, np.random.default_rng(0).normal(size=(64, 64, 64)).astype(np.float32))
+    for chunk in store.chunks.tolist():
+        block = np.random.default_rng(0).normal(size=(64, 64, 64)).astype(np.float32)
+        store.write({LOG_ODDS: BrickValues.of_chunk(tuple(chunk), block)})
     return path
 
 

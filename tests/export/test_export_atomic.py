@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.system.atomic import atomic_path, remove_leftovers, write_npz, write_text
@@ -55,9 +56,8 @@ def test_symbolic_link_stays_a_link(tmp_path: Path) -> None:
 
 
 def test_missing_folder_is_one_line_that_names_the_file(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match=r"absent/report\.json: cannot be written: No such file") as caught:
+    with refusal(MapFileError, "absent/report.json: cannot be written: No such file"):
         write_text(tmp_path / "absent" / "report.json", "{}")
-    assert "\n" not in str(caught.value)
 
 
 def test_target_that_is_a_folder(tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader
 from taichi_mrf.export.growing_store import put_chunks
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.submaps.round_files import RoundResult, SubmapReport, read_layer, write_round
+from taichi_mrf.voxels.layers import LAYERS, LOG_ODDS, BrickValues, Chunk, Layer, Layers
 
 pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 
@@ -19,25 +21,35 @@ HEADER = StoreHeader.of(Config(), -2.0, -8.9, 0.05)
 A, B, C = (0, 0, 0), (-7, 4000, 1), (2, 0, -1)
 
 
-def block(value: float) -> np.ndarray:
-    found = np.full((64, 64, 64), value, np.float32)
-    found[:32] = np.nan
-    return found
+def put(path: Path, values: dict[Chunk, float]) -> None:
+    """Put chunks of one value each, unknown in one half, into a store."""
+    put_chunks(path, HEADER, np.array(list(values), np.int32), layers_of(LOG_ODDS, values))
+
+
+def layers_of(name: str, values: dict[Chunk, float]) -> Layers:
+    layer, bricks, dense = LAYERS[name], [np.zeros((0, 3), np.int32)], []
+    for chunk, value in values.items():
+        block = np.full(layer.chunk_shape, value, layer.dtype)
+        block[:32] = layer.missing
+        found = BrickValues.of_chunk(chunk, block)
+        bricks, dense = [*bricks, found.bricks], [*dense, found.values]
+    none = np.zeros((0, 512, *layer.shape), layer.dtype)
+    return {name: BrickValues(np.concatenate(bricks), np.concatenate([none, *dense]))}
 
 
 def values(path: Path) -> dict[tuple[int, ...], float]:
     """What a reader finds: one value for each chunk."""
     store = ChunkedMap.open(path).store
-    return {tuple(chunk): float(np.nanmax(store.read(chunk))) for chunk in store.chunks.tolist()}
+    return {tuple(chunk): float(np.nanmax(store.read(LOG_ODDS, chunk))) for chunk in store.chunks.tolist()}
 
 
 def test_chunks_are_added_and_replaced(tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
-    put_chunks(path, HEADER, {})
+    put(path, {})
     assert values(path) == {}
-    put_chunks(path, HEADER, {A: block(1), B: block(2)})
+    put(path, {A: 1, B: 2})
     assert values(path) == {A: 1, B: 2}
-    put_chunks(path, HEADER, {C: block(3), A: block(4)})
+    put(path, {C: 3, A: 4})
     assert values(path) == {A: 4, B: 2, C: 3}
     m = ChunkedMap.open(path)
     np.testing.assert_array_equal(m.extent[0], np.array([-7, 0, -1]) * 64 * m.voxel_size)
@@ -49,7 +61,7 @@ def test_an_interrupted_write_leaves_the_old_chunk_or_the_new_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int
 ) -> None:
     path = tmp_path / "map.zarr"
-    put_chunks(path, HEADER, {A: block(1), B: block(2)})
+    put(path, {A: 1, B: 2})
     replace, left = os.replace, [moves]
 
     def move_or_be_interrupted(source: Any, target: Any) -> None:
@@ -61,7 +73,7 @@ def test_an_interrupted_write_leaves_the_old_chunk_or_the_new_one(
 
     monkeypatch.setattr(os, "replace", move_or_be_interrupted)
     try:
-        put_chunks(path, HEADER, {A: block(10), C: block(30)})
+        put(path, {A: 10, C: 30})
         assert moves >= 4
     except KeyboardInterrupt:
         assert moves < 4
@@ -77,9 +89,29 @@ def test_a_store_of_fixed_size_is_not_added_to(tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
     ChunkStore.create(path, HEADER, np.array([A], np.int32))
     with pytest.raises(MapFileError, match="no chunk can be added to it"):
-        put_chunks(path, HEADER, {B: block(1)})
+        put(path, {B: 1})
 
 
 def test_a_chunk_out_of_reach_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match="has no place"):
-        put_chunks(tmp_path / "map.zarr", HEADER, {(1 << 17, 0, 0): block(1)})
+        put(tmp_path / "map.zarr", {(1 << 17, 0, 0): 1})
+
+
+def test_a_new_layer_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LAYERS, "age", Layer("float32", 2, 0, "seconds, and their deviation"))
+    grown, fixed, values = tmp_path / "grown.zarr", tmp_path / "fixed.zarr", {A: 3.0, C: 5.0}
+    ages = layers_of("age", values)
+    put_chunks(grown, HEADER, np.array(list(values), np.int32), {**layers_of(LOG_ODDS, values), **ages})
+    ChunkStore.create(fixed, HEADER, np.array([A, C], np.int32), layers=["age"]).write(ages)
+    for path in (grown, fixed):
+        store = ChunkStore.open(path)
+        assert store.layers == (LOG_ODDS, "age")
+        assert {c: store.read("age", c)[63, 0, 0].tolist() for c in values} == {A: [3, 3], C: [5, 5]}
+        assert not store.read("age", A)[:32].any()
+    report = SubmapReport(0, 0, 1, 1, 1, 0, 0, 0.0, 0.0, 0.0, None)
+    bricks = np.zeros((0, 3), np.int32)
+    nothing = RoundResult(bricks, np.zeros((0, 512), np.float32), bricks, {}, report, ages)
+    write_round(tmp_path / "round.npz", nothing)
+    again = read_layer(tmp_path / "round.npz", "age")
+    np.testing.assert_array_equal(again.bricks, ages["age"].bricks)
+    np.testing.assert_array_equal(again.values, ages["age"].values)

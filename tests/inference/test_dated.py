@@ -283,7 +283,7 @@ def test_log_odds_fade_between_scans() -> None:
 @pytest.mark.usefixtures("one_backend")
 def test_glimpses_are_counted_and_end() -> None:
     m = dated_room([0, 1, 2, 3, 4])
-    dated = m._dated
+    dated = m._parts.dated
     assert dated is not None
     pool = m.view.pool
     pool.read("belief", pool.in_use)

@@ -59,7 +59,7 @@ def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
     (k,) = m.keyframes.values()
     pool, window, index = m.view.pool, k.footprint.window, WindowIndex()
     index.fill(window, k.visible.cells, k.visible.slots)
-    model = m._sweeper.model()
+    model = m._parts.sweeper.model()
     here = np.zeros(pool.capacity * VOXELS, np.float32)
     found = np.zeros((k.ray_list.number, 3), np.float32)
     follow_rays(

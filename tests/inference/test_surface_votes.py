@@ -80,13 +80,13 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
     assume(len(doubtful) < len(voxels))
     called = reference.logistic(CALLED)
     expected = {v: max(p[v], called) if votes.get(v, 0) > 0 else p[v] for v in voxels if v not in doubtful}
-    got = marginals(MapReading(m, m._decisions.log_odds(settled=True)), list(expected))
+    got = marginals(MapReading(m, m._parts, m._parts.decisions.log_odds(settled=True)), list(expected))
     np.testing.assert_allclose(got, list(expected.values()), atol=1e-5)
     np.testing.assert_array_equal(marginals(m.layer(), voxels), before)
     sure = [v for v in voxels if v not in doubtful]
     counted = ti.ndarray(ti.f32, m.view.pool.belief.shape)
-    counted.from_numpy(m._decisions._votes.to_numpy().astype(np.float32) / 4)
-    found = [4 * reference.logit(p) for p in marginals(MapReading(m, counted), sure).tolist()]
+    counted.from_numpy(m._parts.decisions._votes.to_numpy().astype(np.float32) / 4)
+    found = [4 * reference.logit(p) for p in marginals(MapReading(m, m._parts, counted), sure).tolist()]
     np.testing.assert_allclose(found, [votes.get(v, 0) for v in sure], atol=1e-3)
     event(f"{sum(votes.get(v, 0) > 0 for v in expected)} voxels called")
 

@@ -12,7 +12,7 @@ from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
-from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
+from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 
@@ -55,7 +55,9 @@ def test_a_frozen_keyframe_keeps_its_part() -> None:
     assert_same(m.surface(), before)
     np.testing.assert_array_equal(m.decided.state(scene.probes()), state)
     # What is kept is part of the map's size: 12 bytes a voxel for distances, 4 for votes.
-    assert m._kept.share.nbytes < 14 * 512 * (len(m._kept.share.distances.bricks) + m.statistics().bricks)
+    assert m._parts.kept.share.nbytes < 14 * 512 * (
+        len(m._parts.kept.share.distances.bricks) + m.statistics().bricks
+    )
 
 
 def test_it_does_not_depend_on_the_order_of_freezing() -> None:
@@ -64,7 +66,7 @@ def test_it_does_not_depend_on_the_order_of_freezing() -> None:
         for id in order:
             m.freeze_keyframe(id)
     for name in ("distances", "votes"):
-        ours, theirs = getattr(first._kept.share, name), getattr(second._kept.share, name)
+        ours, theirs = getattr(first._parts.kept.share, name), getattr(second._parts.kept.share, name)
         np.testing.assert_array_equal(ours.bricks, theirs.bricks)
         np.testing.assert_array_equal(ours.sums, theirs.sums)
 
@@ -72,7 +74,7 @@ def test_it_does_not_depend_on_the_order_of_freezing() -> None:
 def test_nothing_is_kept_unless_it_is_asked_for(tmp_path: Path) -> None:
     m = build([0, 1], keep=False)
     m.freeze_keyframe(0)
-    assert m._kept.share.nbytes == 0
+    assert m._parts.kept.share.nbytes == 0
     assert not m.has_surface
     with pytest.raises(ConfigError, match="--keep-surface"):
         export_map(m, tmp_path / "mesh.ply", ExportOptions(mesh=True, surface="rays"))
@@ -95,13 +97,10 @@ def test_it_is_saved_with_the_map(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         again.decided.occupancy(scene.probes()), m.decided.occupancy(scene.probes())
     )
-    broken = KeptRays(True)
-    negative = BrickSums(m._kept.share.distances.bricks, -m._kept.share.distances.sums)
-    broken.share = RayShare(negative, m._kept.share.votes)
+    share = m._parts.kept.share
+    m._parts.kept.share = RayShare(BrickSums(share.distances.bricks, -share.distances.sums), share.votes)
     header = read_contents(tmp_path / "map.npz").header
-    write_contents(
-        tmp_path / "bad.npz", contents_of(header, m._registry, m.keyframes.values(), m._frozen, kept=broken)
-    )
+    write_contents(tmp_path / "bad.npz", contents_of(header, m._parts, []))
     with pytest.raises(MapFileError, match="what frozen keyframes measured"):
         MRFMap.load(tmp_path / "bad.npz")
 

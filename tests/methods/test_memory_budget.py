@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 
 def assert_counts_all(m: MRFMap, bricks: dict[int, int]) -> None:
     """The sums are those of the keyframes, whose ``bricks`` are as many as when they came."""
-    budget, keyframes = m._allocator.budget, m.keyframes.values()
+    budget, keyframes = m._parts.allocator.budget, m.keyframes.values()
     assert budget._messages == sum(2 * VOXELS * bricks[k.id] for k in keyframes)
     assert budget._images == sum(k.image_bytes for k in keyframes)
     assert budget._reserved == sum(2 * VOXELS * bricks[k.id] for k in keyframes if k.messages is None)
@@ -50,7 +50,7 @@ def test_a_keyframe_that_does_not_fit_is_not_counted() -> None:
     m._pool.memory_limit_gb = 1e-6
     with pytest.raises(CapacityError, match="a map of 2 keyframes"):
         small_room.add(m, small_room.frames()[5])
-    assert len(m.keyframes) == len(m._allocator.budget._shares) == 1
+    assert len(m.keyframes) == len(m._parts.allocator.budget._shares) == 1
 
 
 def test_a_full_inference_that_is_given_up_reserves_memory_for_the_messages_again() -> None:
@@ -60,10 +60,10 @@ def test_a_full_inference_that_is_given_up_reserves_memory_for_the_messages_agai
     bricks = {id: len(k.visible.slots) for id, k in m.keyframes.items()}
     checkpoint = m.checkpoint()
     m.infer(progress=lambda step: False)
-    assert m._allocator.budget._reserved == 0
+    assert m._parts.allocator.budget._reserved == 0
     m.restore(checkpoint)
     assert_counts_all(m, bricks)
-    assert m._allocator.budget._reserved > 0
+    assert m._parts.allocator.budget._reserved > 0
 
 
 def test_a_keyframe_that_cannot_be_moved_stays_although_the_map_is_over_its_limit() -> None:
@@ -80,15 +80,15 @@ def test_a_keyframe_that_cannot_be_moved_stays_although_the_map_is_over_its_limi
     m.infer()
     np.testing.assert_array_equal(m.occupancy(small_room.probes()), before)
     m.remove_keyframe(ids[1])
-    assert len(m.keyframes) == len(m._allocator.budget._shares) == 2
+    assert len(m.keyframes) == len(m._parts.allocator.budget._shares) == 2
 
 
 def test_a_move_that_does_not_fit_leaves_the_keyframe_counted() -> None:
     m = MRFMap(small_room.VOXEL_SIZE)
     id = small_room.add(m, small_room.frames()[0])
-    before = m._allocator.budget._messages
+    before = m._parts.allocator.budget._messages
     far = np.eye(4)
     far[0, 3] = 1e7
     with pytest.raises(CapacityError):
         m.move_keyframe(id, far)
-    assert m._allocator.budget._messages == before
+    assert m._parts.allocator.budget._messages == before

@@ -5,15 +5,10 @@ import itertools
 import numpy as np
 import pytest
 from hand_made import PRIOR
-from queried_maps import HandMap, hand_map, map_of
+from queried_maps import HandMap, map_of
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.cells import all_cells, standing_cells
-
-
-@pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
 
 
 def expected(log_odds: np.ndarray) -> float:

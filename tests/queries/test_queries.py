@@ -10,7 +10,6 @@ from hand_made import (
     VOXEL,
     HandMade,
     made,
-    made_at_random,
     profile_of,
     rays_into,
 )
@@ -32,11 +31,6 @@ from taichi_mrf.voxels.pool import BrickPool
 pytestmark = pytest.mark.usefixtures("backend")
 
 SEEN_FREE = PRIOR - 6.9
-
-
-@pytest.fixture(scope="module")
-def random_map(backend: str) -> HandMade:
-    return made_at_random(backend)
 
 
 def points_in(bricks: NDArray[np.int32], count: int, seed: int) -> NDArray[np.float64]:

@@ -25,11 +25,6 @@ from taichi_mrf.queries.slices import MapSlice, slice_map
 from taichi_mrf.voxels.layout import BRICK
 
 
-@pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
-
-
 def voxels_of(lowest: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.indices(shape).reshape(3, -1).T + lowest
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hand_made import BRICK_M, VOXEL
 from oracles.traversal import segments
-from queried_maps import HandMap, hand_map, room_map
+from queried_maps import HandMap, room_map
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -12,11 +12,6 @@ from taichi_mrf.queries import cast
 from taichi_mrf.queries.cast import RayHits, cast_rays
 
 MAX_RANGE = 3.0
-
-
-@pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
 
 
 def rays(hand: HandMap, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -51,11 +51,20 @@ def trimmed(values: np.ndarray, max_m: float = MAX_M, voxel_size: float = VOXEL)
     return values[(slice(margin, -margin),) * 3]
 
 
+@pytest.fixture(scope="module")
+def around_hand(hand: HandMap) -> tuple[np.ndarray, np.ndarray]:
+    """The centres of the voxels of a box around the map, and their states by the oracle."""
+    points = centres(np.array([-72, -8, -56]), np.array([24, 88, 40]), VOXEL)
+    state = hand.true_state(np.floor(points.reshape(-1, 3) / VOXEL).astype(int))
+    return points, state.reshape(points.shape[:3])
+
+
 @pytest.mark.backends
 @pytest.mark.parametrize("unknown", RULES)
-def test_distances_at_the_centres_are_those_of_scipys_transform(hand: HandMap, unknown: Any) -> None:
-    points = centres(np.array([-72, -8, -56]), np.array([24, 88, 40]), VOXEL)
-    state = hand.true_state(np.floor(points.reshape(-1, 3) / VOXEL).astype(int)).reshape(points.shape[:3])
+def test_distances_at_the_centres_are_those_of_scipys_transform(
+    hand: HandMap, around_hand: tuple[np.ndarray, np.ndarray], unknown: Any
+) -> None:
+    points, state = around_hand
     wanted = trimmed(transformed(state, unknown, MAX_M, VOXEL))
     field = DistanceField(hand, MAX_M, unknown)
     found = trimmed(field.distance(points.reshape(-1, 3)).reshape(points.shape[:3]))

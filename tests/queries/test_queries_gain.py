@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hand_made import VOXEL
 from oracles.traversal import segments
-from queried_maps import SEEN_FREE, HandMap, hand_map, room_map
+from queried_maps import SEEN_FREE, HandMap, room_map
 
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import look_at
@@ -22,11 +22,6 @@ VIEWS = [
     look_at((-1.21, 1.93, 0.9), (-1.2, 2.0, 0.0)),
 ]
 """From within the map to its sides and its corner, and from just above it."""
-
-
-@pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
 
 
 def expected(hand: HandMap, T_world_camera: np.ndarray, empty_below: float = -np.inf) -> np.ndarray:

@@ -12,7 +12,6 @@ from hand_made import (
     VIEWS,
     VOXEL,
     HandMade,
-    made_at_random,
     profile_of,
     rays_into,
     row_of_voxels,
@@ -48,11 +47,6 @@ NOISE = PatchNoise(SIGMA, BIAS, PATCH, CAMERA)
 def noise_at(u: int, v: int) -> Noise:
     row = v // PATCH * PATCHES[1] + u // PATCH
     return Noise(tuple(SIGMA[row]), tuple(BIAS[row]))
-
-
-@pytest.fixture(scope="module")
-def random_map(backend: str) -> HandMade:
-    return made_at_random(backend)
 
 
 def measured_in(hand: HandMade, T: Pose, seed: int) -> NDArray[np.float32]:

@@ -9,18 +9,13 @@ import pytest
 from hand_made import PRIOR, VOXEL
 from oracles.inference import Ray, Segment, enumerate_marginals
 from oracles.traversal import segments
-from queried_maps import SEEN_FREE, HandMap, hand_map, map_of, room, room_map
+from queried_maps import SEEN_FREE, HandMap, map_of, room, room_map
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.within import occupied_within, path_collision
 
 UNKNOWN_P = 1 / (1 + math.exp(-PRIOR))
-
-
-@pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
 
 
 def grid(hand: HandMap) -> tuple:

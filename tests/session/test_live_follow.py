@@ -12,8 +12,8 @@ from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
 from taichi_mrf.datasets.pose_sources.posed import posed_by
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.mapping import follow
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.viewer.messages import KeyframeInfo, Move, Status, Switch
 
 pytestmark = pytest.mark.usefixtures("one_backend")

@@ -38,8 +38,8 @@ from taichi_mrf.runs.files import TRAJECTORY_FILE
 from taichi_mrf.runs.folder import write_run
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.replay import Replay
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.viewer.messages import (
     CurrentCamera,
     KeyframeInfo,

@@ -30,8 +30,8 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import Source, open_source
 from taichi_mrf.viewer.messages import (
     Bricks,
@@ -321,7 +321,7 @@ def test_many_resets_do_not_run_out_of_maps() -> None:
     session = session_of(link, room(1))
     for _ in range(70):
         link.ask(Reset())
-        session.run(lambda: not len(session.state.inbox) and session.state.is_done)
+        session.run(lambda: not len(session.state.waiting) and session.state.is_done)
     assert link.errors() == []
 
 
@@ -433,7 +433,7 @@ def test_clients_that_never_stop_moving_a_keyframe_do_not_stop_mapping(
     def over() -> bool:
         mapper = session.state.mapper
         link.ask(*(Move(id, T) for id in mapper.roster.entries for _ in range(10)))
-        return len(mapper.roster.entries) == 4 and len(session.state.inbox) > 0
+        return len(mapper.roster.entries) == 4 and len(session.state.waiting) > 0
 
     session.run(over)
     assert len(session.state.mapper.map.keyframes) == 4

@@ -13,8 +13,8 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Bricks, SceneChanges, ShowTime, Switch, TimeSpan
@@ -154,7 +154,7 @@ def test_a_saved_map_is_done_at_once_with_what_moves_and_its_past_brings_its_mes
 
 
 def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.session.change_list.SHARE_OF_TIME", 1.0)
+    monkeypatch.setattr("taichi_mrf.session.shown_extras.SHARE_OF_TIME", 1.0)
     link = FakeLink()
     finished(session_of(link, visited(), DATED))
     (latest,) = [update.changes for update in link.of_type(SceneChanges)][-1:]
@@ -168,7 +168,7 @@ def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPat
 
 
 def test_nothing_is_listed_of_a_scene_in_which_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_mrf.session.change_list.SHARE_OF_TIME", 1.0)
+    monkeypatch.setattr("taichi_mrf.session.shown_extras.SHARE_OF_TIME", 1.0)
     link = FakeLink()
     finished(session_of(link, VisitedRoom("empty", small_room.frames()[0].camera, count=EMPTY), DATED))
     assert link.of_type(SceneChanges) == []

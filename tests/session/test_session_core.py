@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taichi_mrf.session.session_core import Inbox
+from taichi_mrf.session.session_core import WaitingRequests
 from taichi_mrf.viewer.messages import Freeze, Move, Pause, Request, Reset, Save, Speed, Step, Switch
 from taichi_mrf.viewer.tune.messages import SaveTries
 
@@ -29,19 +29,19 @@ def move(keyframe: int, x: float) -> Move:
     ],
 )
 def test_a_later_request_replaces_a_waiting_one_of_its_kind(asked: list[Request], kept: list[int]) -> None:
-    inbox = Inbox()
+    requests = WaitingRequests()
     for request in asked:
-        inbox.put(request)
-    waiting = list(inbox)
+        requests.put(request)
+    waiting = list(requests)
     assert len(waiting) == len(kept)
     # The later one of equal requests is kept, so look only at what they say.
     assert all(repr(a) == repr(asked[i]) for a, i in zip(waiting, kept, strict=True))
 
 
 def test_requests_that_are_put_back_come_first() -> None:
-    inbox = Inbox()
-    inbox.put(Speed(1.0))
-    inbox.put_back([Freeze(1), Freeze(2)])
-    assert list(inbox) == [Freeze(1), Freeze(2), Speed(1.0)]
-    assert inbox.has_edits()
-    assert inbox.take() == Freeze(1)
+    requests = WaitingRequests()
+    requests.put(Speed(1.0))
+    requests.put_back([Freeze(1), Freeze(2)])
+    assert list(requests) == [Freeze(1), Freeze(2), Speed(1.0)]
+    assert requests.has_edits()
+    assert requests.take() == Freeze(1)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from in_process import InProcess
 from scipy.spatial import KDTree
 from small_room import VOXEL_SIZE, add, frames
 
 from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.cluster.local import LocalProcesses
-from taichi_mrf.cluster.runner import InProcess
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
@@ -30,18 +30,18 @@ from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import SeenKeyframe, chunks_for, plan_submaps
+from taichi_mrf.submaps.plan import Job, SeenKeyframe, SourceFrames, chunks_for, plan_submaps
 from taichi_mrf.submaps.round_files import read_core, read_report, round_path
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.submaps.task import share_moved
+from taichi_mrf.voxels.layers import LOG_ODDS
 from taichi_mrf.voxels.layout import CHUNK
 
 zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 
 SOURCE = "synthetic:corridor?rooms=2&frames=24&width=80&height=60"
-SEQUENCE = Sequence(SOURCE, SourceFlags().keywords())
+SEQUENCE = SourceFrames(SOURCE, SourceFlags().keywords())
 CONFIG = Config(
     0.1,
     inference=InferenceConfig(outlier_floor=1e-6),  # set, so that no recording's own takes its place
@@ -232,7 +232,7 @@ def test_what_moved_is_a_share_of_probabilities() -> None:
 
 
 def test_only_the_same_run_is_gone_on_with(exchanged: Path) -> None:
-    sequence = Sequence(SOURCE.replace("24", "25"), SEQUENCE.reading)
+    sequence = SourceFrames(SOURCE.replace("24", "25"), SEQUENCE.reading)
     for other, config, size, named in (
         (sequence, CONFIG, SUBMAP_M, "source"),
         (SEQUENCE, Config(0.2, evaluation=CONFIG.evaluation), SUBMAP_M, "voxel_size"),
@@ -254,7 +254,7 @@ def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=problem):
             map_in_submaps(SEQUENCE, config, 6.4, tmp_path / "s", tmp_path / "m.zarr", InProcess(), rounds=0)
-    nothing = Sequence("synthetic:corridor?frames=3", SEQUENCE.reading, limit=1)
+    nothing = SourceFrames("synthetic:corridor?frames=3", SEQUENCE.reading, limit=1)
     with pytest.raises(DatasetError, match="no frame could be mapped"):
         map_in_submaps(
             nothing, Config(0.1, evaluation=EvaluationConfig(hold_out=0), keyframes=CONFIG.keyframes),
@@ -321,7 +321,7 @@ def test_a_killed_worker_changes_nothing(exchanged: Path, tmp_path: Path) -> Non
     ours, theirs = ChunkedMap.open(tmp_path / "map.zarr"), ChunkedMap.open(exchanged / "map.zarr")
     np.testing.assert_array_equal(ours.chunks, theirs.chunks)
     for place in ours.chunks:
-        np.testing.assert_array_equal(ours.store.read(place), theirs.store.read(place))
+        np.testing.assert_array_equal(ours.store.read(LOG_ODDS, place), theirs.store.read(LOG_ODDS, place))
     assert len(result.rounds) == 2
 
 

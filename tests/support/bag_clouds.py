@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from inputs_bags import BODY, Bag, Kind, writing
+from inputs_bags import BODY, Bag, Kind, write_bag
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -89,9 +89,8 @@ def stamp(scan: int) -> float:
 
 
 def write(folder: Path, kind: Kind = "mcap", **options: Any) -> Path:
-    path = folder / ("walk.bag" if kind == "ros1" else "walk")
-    with writing(path, kind) as bag:
+    def scans(bag: Bag) -> None:
         for scan in range(SCANS):
             send(bag, stamp(scan), points(scan), **options)
-        drive(bag)
-    return path
+
+    return write_bag(folder, scans, drive, kind=kind)

@@ -1,12 +1,12 @@
 """Copies of a recording with one of the usual mistakes of conventions made on purpose."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from datasets_recordings import quaternion_of
+from inputs_frames import Frames
 
-from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.geometry.poses import inverse
@@ -84,20 +84,6 @@ BREAKS: dict[str, Break] = {
     "late": late(LATE_S),
     "intrinsics": of_camera(2.0),
 }
-
-
-@dataclass
-class Frames(Dataset):
-    """Frames that are at hand."""
-
-    frames: Sequence[Frame] = field(default=())
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return [frame.name for frame in self.frames]
-
-    def read(self, index: int) -> Frame:
-        return self.frames[index]
 
 
 def of_frames(frames: Sequence[Frame]) -> Frames:

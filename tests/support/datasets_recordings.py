@@ -9,7 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -60,12 +62,8 @@ def row_of(matrix: NDArray[np.float64]) -> str:
 
 
 def quaternion_of(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x y z w of a rotation, from its axis (the eigenvector to the eigenvalue 1) and angle."""
-    values, vectors = np.linalg.eig(R)
-    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
-    antisymmetric = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle = np.arctan2(antisymmetric @ axis / 2, (np.trace(R) - 1) / 2)
-    return np.array([*(np.sin(angle / 2) * axis), np.cos(angle / 2)])
+    """x y z w of a rotation."""
+    return Rotation.from_matrix(R).as_quat()
 
 
 def stamped_line(stamp: float, pose: Pose) -> str:
@@ -123,9 +121,6 @@ def write_log(path: Path, poses: list[Pose], first: int = 0) -> Path:
     blocks = (f"{first + i} {first + i} {first + i + 1}\n{text_of(pose)}" for i, pose in enumerate(poses))
     path.write_text("\n".join(blocks))
     return path
-
-
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 
 
 K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
@@ -264,3 +259,21 @@ FORMATS = {  # writer, steps per metre, whether colour is written
     "icl": (write_icl, 5000.0, False),
     "house": (write_house, 5000.0, False),
 }
+
+
+def check_frames(
+    dataset: Dataset, content: Content, steps: float, colored: bool = False, camera: PinholeCamera = CAMERA
+) -> None:
+    """The frames are those of the content, and of the camera."""
+    assert dataset.camera == camera
+    assert len(dataset) == len(dataset.frame_names) == content.count
+    for i, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.depth_m, content.depth[i] / np.float32(steps), rtol=1e-6)
+        assert frame.depth_m.dtype == np.float32
+        assert frame.depth_m[0, 0] == 0
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        assert (frame.camera, frame.name) == (camera, dataset.frame_names[i])
+        if colored:
+            np.testing.assert_array_equal(frame.color, content.color[i])
+        else:
+            assert frame.color is None

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from fuzz_damage import BYTES, PNG, TEXT, ZIP, Damage
-from fuzz_loaders import LOADERS, Loader, map_last_dataset
+from fuzz_loaders import LOADERS, map_last_dataset
 
 from taichi_mrf.errors import TaichiMRFError
 
@@ -89,8 +89,3 @@ def _check_words(case: str, said: str, folder: Path) -> None:
         raise FuzzError(f"{case}: not one line: {said[:300]!r}")
     if str(folder) not in said:
         raise FuzzError(f"{case}: names no file: {said}")
-
-
-def loaders() -> list[Loader]:
-    """All of them."""
-    return LOADERS

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from bag_clouds import write as write_clouds
 from datasets_recordings import (
+    CAMERA,
     INTRINSIC,
     Content,
     arrays,
@@ -35,8 +36,7 @@ from datasets_recordings import (
     write_stray,
     write_tum,
 )
-from inputs_bags import Bag, Kind, plain, writing
-from kitti_street import write_kitti
+from inputs_bags import Bag, plain, write_bag
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
 from point_clouds import Walk, write_pcd, write_velodyne
@@ -47,6 +47,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rtabmap_database import Database, calibration, encoded, rvl
 from stereo_rig import write as write_stereo_file
+from stereo_rig import write_kitti
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.truth_sources import read_stamps
@@ -74,9 +75,8 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PatchNoise, noise_from_config
 from taichi_mrf.system.atomic import write_npz as write_arrays
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 WALK = Walk(points=12)
-PCD_KINDS = ("ascii", "binary", "binary_compressed")
+CONTENT = Content(2)
 
 
 class FramesRefusedError(TaichiMRFError):
@@ -248,80 +248,44 @@ def _depth_images(path: Path) -> bytes:
     return _arrays_of(*((name, files.read(name)) for name in files.names))
 
 
-def _content() -> Content:
-    return Content(2)
-
-
-def _seven_scenes(folder: Path) -> Path:
-    return write_seven_scenes(folder, _content())
-
-
 def _with_camera(name: str, text: str, folder: Path) -> Path:
-    write_seven_scenes(folder, _content())
+    write_seven_scenes(folder, CONTENT)
     (folder / "camera.txt").unlink()
     (folder / name).write_text(text)
     return folder
 
 
-def _tum(folder: Path) -> Path:
-    return write_tum(folder, _content())
-
-
 def _redwood(folder: Path) -> Path:
-    write_log(write_numbered(folder, _content()) / "trajectory.log", _content().poses)
+    write_log(write_numbered(folder, CONTENT) / "trajectory.log", CONTENT.poses)
     return folder
 
 
 def _icl(folder: Path) -> Path:
-    write_numbered(folder, _content())
-    lines = [stamped_line(i, pose) for i, pose in enumerate(_content().poses)]
+    write_numbered(folder, CONTENT)
+    lines = [stamped_line(i, pose) for i, pose in enumerate(CONTENT.poses)]
     (folder / "livingRoom2.gt.freiburg").write_text("\n".join(lines))
     return folder
 
 
 def _open3d(folder: Path) -> Path:
-    write_numbered(folder, _content(), place="depth")
+    write_numbered(folder, CONTENT, place="depth")
     (folder / "camera.txt").unlink()
-    entries = [{"extrinsic": column_by_column(p), "intrinsic": INTRINSIC} for p in _content().poses]
+    entries = [{"extrinsic": column_by_column(p), "intrinsic": INTRINSIC} for p in CONTENT.poses]
     values = {"class_name": "PinholeCameraTrajectory", "parameters": entries}
     (folder / "trajectory.json").write_text(json.dumps(values, indent=1))
     return folder
 
 
-def _scannet(folder: Path) -> Path:
-    return write_scannet(folder, _content())
-
-
-def _replica(folder: Path) -> Path:
-    return write_replica(folder, _content(), folder / "cam_params.json")
-
-
-def _stray(folder: Path) -> Path:
-    return write_stray(folder, _content())
-
-
 def _record3d(folder: Path) -> Path:
     """Packed where the library is there."""
     lzfse = import_module("lzfse") if find_spec("lzfse") else None
-    return write_record3d(folder / "walk", _content(), bytes if lzfse is None else lzfse.compress)
-
-
-def _record3d_zip(folder: Path) -> Path:
-    return write_record3d(folder / "walk.r3d", _content())
-
-
-def _npz(folder: Path) -> Path:
-    return write_npz(folder / "walk.npz", arrays(_content()))
+    return write_record3d(folder / "walk", CONTENT, bytes if lzfse is None else lzfse.compress)
 
 
 def _npz_folder(folder: Path) -> Path:
     for name in ("a", "b"):
-        write_npz(folder / f"{name}.npz", arrays(_content()))
+        write_npz(folder / f"{name}.npz", arrays(CONTENT))
     return folder
-
-
-def _kitti(folder: Path) -> Path:
-    return write_kitti(folder)
 
 
 def _lidar_plies(folder: Path) -> Path:
@@ -350,27 +314,12 @@ def _survey(folder: Path) -> Path:
     return folder / "walk.las"
 
 
-def _velodyne(folder: Path) -> Path:
-    return write_velodyne(folder / "walk", WALK, WALK.poses[2])
-
-
 def _several(folder: Path) -> Path:
-    _npz(folder)
+    write_npz(folder / "walk.npz", arrays(CONTENT))
     write_lidar_scans(folder / "scans", WALK)
     text = "sensors:\n  - name: depth\n    source: walk.npz\n  - source: scans\n    sigma: [0.02, 0.001]\n"
     (folder / "robot.yaml").write_text(text + "    every: 2\n    max_depth: 5.0\n")
     return folder / "robot.yaml"
-
-
-def _stereo(folder: Path) -> Path:
-    return write_stereo_file(folder, ["a", "b", "c"])
-
-
-def _bag(kind: Kind, folder: Path) -> Path:
-    path = folder / ("walk.bag" if kind == "ros1" else "walk")
-    with writing(path, kind) as bag:
-        plain(bag)
-    return path
 
 
 def _packed_bag(mode: CompressionMode, folder: Path) -> Path:
@@ -384,10 +333,6 @@ def _packed_bag(mode: CompressionMode, folder: Path) -> Path:
 
 def _image_file(suffix: str, folder: Path) -> Path:
     return write_image(folder / f"image{suffix}", np.arange(48, dtype=np.uint8).reshape(6, 8))
-
-
-def _image(path: Path) -> bytes:
-    return read_grey(path).tobytes()
 
 
 def _carmen_text() -> str:
@@ -496,7 +441,7 @@ def _pose_graph_file(folder: Path) -> Path:
 
 
 def _rtabmap_file(folder: Path) -> Path:
-    path, content = folder / "walk.db", _content()
+    path, content = folder / "walk.db", CONTENT
     database = Database(path)
     height, width = content.size
     camera = calibration(PinholeCamera(width, height, 14.0, 15.0, 7.5, 5.5))
@@ -510,7 +455,7 @@ def _rtabmap_file(folder: Path) -> Path:
 
 
 def _stream_file(folder: Path) -> Path:
-    lines = [stamped_line(0.1 * i, pose) for i, pose in enumerate(_content().poses)]
+    lines = [stamped_line(0.1 * i, pose) for i, pose in enumerate(CONTENT.poses)]
     (folder / "poses.txt").write_text("\n".join(lines))
     return folder / "poses.txt"
 
@@ -521,7 +466,7 @@ def _stamps_file(folder: Path) -> Path:
 
 
 def _stack(suffix: str, folder: Path) -> Path:
-    depth_m = np.stack(_content().depth) / np.float32(1000)
+    depth_m = np.stack(CONTENT.depth) / np.float32(1000)
     if suffix == ".npy":
         np.save(folder / "stack.npy", depth_m)
     else:
@@ -536,47 +481,50 @@ def _ply(folder: Path) -> Path:
     return folder / "mesh.ply"
 
 
-def _stamps(path: Path) -> bytes:
-    return _arrays_of(read_stamps(path))
+def _of(write: Callable[[Path, Content], Path], name: str = "") -> Callable[[Path], Path]:
+    """Writes the frames into the folder, or a file there."""
+    return lambda folder: write(folder / name, CONTENT)
 
 
 K_TXT = "14 0 7.5\n0 15 5.5\n0 0 1"
 CAMERA_YAML = "width: 16\nheight: 12\nfx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\n"
 
 LOADERS = [
-    Loader("7-Scenes", _seven_scenes, _dataset),
+    Loader("7-Scenes", _of(write_seven_scenes), _dataset),
     Loader("7-Scenes, camera.yaml", partial(_with_camera, "camera.yaml", CAMERA_YAML), _dataset),
     Loader("7-Scenes, intrinsics.txt", partial(_with_camera, "intrinsics.txt", K_TXT), _dataset),
-    Loader("TUM RGB-D", _tum, _dataset),
+    Loader("TUM RGB-D", _of(write_tum), _dataset),
     Loader("Redwood .log", _redwood, _dataset),
     Loader("ICL-NUIM .freiburg", _icl, _dataset),
     Loader("Open3D JSON", _open3d, _dataset),
-    Loader("ScanNet", _scannet, _dataset),
-    Loader("Replica", _replica, _dataset),
-    Loader("Stray Scanner", _stray, _dataset),
+    Loader("ScanNet", _of(write_scannet), _dataset),
+    Loader("Replica", lambda folder: write_replica(folder, CONTENT, folder / "cam_params.json"), _dataset),
+    Loader("Stray Scanner", _of(write_stray), _dataset),
     Loader("Record3D", _record3d, _dataset),
-    Loader("Record3D .r3d", _record3d_zip, _dataset),
-    Loader("frames npz", _npz, _dataset, sealed=True),
+    Loader("Record3D .r3d", _of(write_record3d, "walk.r3d"), _dataset),
+    Loader(
+        "frames npz", lambda folder: write_npz(folder / "walk.npz", arrays(CONTENT)), _dataset, sealed=True
+    ),
     Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
-    Loader("KITTI stereo", _kitti, _dataset),
+    Loader("KITTI stereo", write_kitti, _dataset),
     Loader("several sensors", _several, _dataset),
-    Loader("stereo YAML", _stereo, _dataset),
+    Loader("stereo YAML", partial(write_stereo_file, names=["a", "b", "c"]), _dataset),
     Loader("lidar npz", partial(write_lidar_scans, walk=WALK), _dataset, sealed=True),
     Loader("lidar PLY", _lidar_plies, _dataset),
     *(
         Loader(f"PCD {each}", partial(_pcds, each), _dataset)
         for each in ("ascii", "binary", "binary_compressed")
     ),
-    Loader("KITTI velodyne", _velodyne, _dataset),
+    Loader("KITTI velodyne", lambda folder: write_velodyne(folder / "walk", WALK, WALK.poses[2]), _dataset),
     *([Loader("LAS survey", _survey, _dataset)] if find_spec("laspy") else []),
-    Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
-    Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
-    Loader("MCAP", partial(_bag, "mcap"), _dataset),
+    Loader("ROS 1 bag", lambda folder: write_bag(folder, plain, kind="ros1"), _dataset),
+    Loader("ROS 2 bag, sqlite", lambda folder: write_bag(folder, plain, kind="sqlite"), _dataset),
+    Loader("MCAP", lambda folder: write_bag(folder, plain, kind="mcap"), _dataset),
     Loader("ROS 2 bag, clouds", partial(write_clouds, kind="sqlite"), _dataset),
     Loader("ROS 2 bag, packed messages", partial(_packed_bag, CompressionMode.MESSAGE), _dataset),
     Loader("ROS 2 bag, packed file", partial(_packed_bag, CompressionMode.FILE), _dataset),
     *(
-        Loader(f"image {suffix}", partial(_image_file, suffix), _image)
+        Loader(f"image {suffix}", partial(_image_file, suffix), lambda path: read_grey(path).tobytes())
         for suffix in (".jpg", ".tiff", ".webp", ".bmp", ".pgm")
     ),
     Loader("CARMEN log", _carmen, _scans),
@@ -595,7 +543,7 @@ LOADERS = [
     Loader("pose stream", _stream_file, _stream),
     Loader("pose graph", _pose_graph_file, _pose_graph),
     Loader("RTAB-Map database", _rtabmap_file, _dataset),
-    Loader("stamps", _stamps_file, _stamps),
+    Loader("stamps", _stamps_file, lambda path: _arrays_of(read_stamps(path))),
     Loader("depth stack npy", partial(_stack, ".npy"), _depth_images),
     Loader("depth stack npz", partial(_stack, ".npz"), _depth_images, sealed=True),
     Loader("mesh PLY", _ply, _mesh),

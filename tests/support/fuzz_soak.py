@@ -29,13 +29,14 @@ OUTCOMES = ("refused", "same", "other", "failed")
 def work(pipe: Connection, folder: str) -> None:
     """Carry out the cases that come through the pipe, until it closes."""
     faulthandler.enable()
-    from fuzz_case import FuzzError, loaders, run_case
+    from fuzz_case import FuzzError, run_case
+    from fuzz_loaders import LOADERS
 
     from taichi_mrf.system import runtime
 
     runtime.init("cpu")
     root = Path(folder)
-    for loader in loaders():  # the good ones, so that no kernel is compiled when memory is short
+    for loader in LOADERS:  # the good ones, so that no kernel is compiled when memory is short
         try:
             run_case(loader.name, 0, root)
         except FuzzError as failure:
@@ -101,9 +102,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first round")
     parser.add_argument("--only", default="", help="loaders whose name contains this")
     arguments = parser.parse_args()
-    from fuzz_case import loaders
+    from fuzz_loaders import LOADERS
 
-    names = [loader.name for loader in loaders() if arguments.only in loader.name]
+    names = [loader.name for loader in LOADERS if arguments.only in loader.name]
     counts: dict[str, Counter[str]] = {name: Counter() for name in names}
     slowest, failures = (0.0, ""), []
     worker = Worker()

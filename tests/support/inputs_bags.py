@@ -1,20 +1,21 @@
 """Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from datasets_recordings import quaternion_of
+from datasets_recordings import CAMERA, quaternion_of
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -249,18 +250,21 @@ def writing(path: Path, kind: Kind) -> Iterator[Bag]:
         yield Bag(kind, writer)
 
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+def write_bag(folder: Path, *parts: Callable[[Bag], object], kind: Kind = "ros1", name: str = "walk") -> Path:
+    """A bag of parts; returns its path. A second one of the same name has a number behind it."""
+    suffix = ".bag" if kind == "ros1" else ""
+    path = folder / (name + suffix)
+    if path.exists():
+        path = folder / f"{name}{len(list(folder.iterdir()))}{suffix}"
+    with writing(path, kind) as bag:
+        for part in parts:
+            part(bag)
+    return path
 
 
 COUNT = 5
-
-
 FRAME = "camera_depth_optical_frame"
-
-
 BODY = "base_link"
-
-
 T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
 
 
@@ -298,3 +302,13 @@ def plain(bag: Bag) -> None:
     images(bag)
     odometry(bag)
     mounted(bag)
+
+
+def check_poses(
+    dataset: Dataset, T_fixed: Pose | None = None, mount: Pose = T_body_camera, count: int = COUNT
+) -> None:
+    """Its frames are at the body's poses, seen from a fixed frame, and mounted so."""
+    assert len(dataset) == count
+    for i, frame in enumerate(dataset):
+        T = (np.eye(4) if T_fixed is None else T_fixed) @ world_body(i) @ mount
+        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)

@@ -14,8 +14,8 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.replay import Replay
-from taichi_mrf.session.run import Policy
 from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import (
     LOG_ODDS_STEP,

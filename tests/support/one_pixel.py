@@ -10,11 +10,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 
 VOXEL = 0.1
-
-
 ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
-
-
 WITH_LENGTHS = replace(AS_PRINTED, segment_lengths=True)
 
 

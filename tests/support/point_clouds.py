@@ -4,6 +4,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from datasets_recordings import quaternion_of, row_of
@@ -153,6 +154,24 @@ def las_head(number: int, packed: bool = False, /, **changes: int) -> bytes:
     table = changes.get("table", begin + 8 + 100)
     chunks = struct.pack("<II", 0, changes.get("chunks", 1))
     return head + packing + struct.pack("<q", table) + bytes(100) + chunks + bytes(20)
+
+
+class LasFile:
+    """A stand-in for an open file of laspy's and for its points."""
+
+    def __init__(self, points_m: Points, times: NDArray[np.float64] | None = None) -> None:
+        names = ["X", "Y", "Z", *([] if times is None else ["gps_time"])]
+        self.point_format = SimpleNamespace(id=0 if times is None else 1, dimension_names=names)
+        self.xyz, self.gps_time = points_m, times
+
+    def __enter__(self) -> "LasFile":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def read(self) -> "LasFile":
+        return self
 
 
 class RoomWalk(Walk):

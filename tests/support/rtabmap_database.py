@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
+import inputs_bags
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,33 +78,8 @@ def encoded(image: NDArray, ending: str = ".png") -> bytes:
 
 
 def rvl(image: NDArray[np.uint16]) -> bytes:
-    """RVL, number by number."""
-    nibbles: list[int] = []
-
-    def put(value: int) -> None:
-        while True:
-            nibbles.append(value & 7 | (8 if value >> 3 else 0))
-            value >>= 3
-            if not value:
-                return
-
-    pixels, place, last = image.reshape(-1).tolist(), 0, 0
-    while place < len(pixels):
-        zeros = next((i for i, value in enumerate(pixels[place:]) if value), len(pixels) - place)
-        place += zeros
-        others = next((i for i, value in enumerate(pixels[place:]) if not value), len(pixels) - place)
-        put(zeros)
-        put(others)
-        for value in pixels[place : place + others]:
-            delta, last = value - last, value
-            put(2 * delta if delta >= 0 else -2 * delta - 1)
-        place += others
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [
-        int("".join(f"{nibble:x}" for nibble in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)
-    ]
-    height, width = image.shape
-    return b"DEPTHRVL" + struct.pack("<2I", width, height) + struct.pack(f"<{len(words)}I", *words)
+    """RVL as the database holds it."""
+    return b"DEPTHRVL" + inputs_bags.rvl(image)
 
 
 class Database:

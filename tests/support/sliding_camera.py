@@ -14,11 +14,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
 CAMERA = PinholeCamera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
-
-
 WALL_M = 1.5
-
-
 ALL_FRAMES = Config(voxel_size=0.1, evaluation=EvaluationConfig(hold_out=0))
 
 

@@ -12,7 +12,7 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.search import DEFAULT_SEARCH, SIGMA_SCALE, Search, dimensions
-from taichi_mrf.tune.verdict import FOUND, SHIPPED, STARTED, Judged, contenders, judge_unseen, verdict_lines
+from taichi_mrf.tune.trial import FOUND, SHIPPED, STARTED, Judged, contenders, judge_unseen, verdict_lines
 from taichi_mrf.viewer.tune.knobs import KNOBS
 
 pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")

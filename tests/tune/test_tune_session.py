@@ -10,9 +10,10 @@ from tune_scene import CHOICE, CONFIG, room, working_set
 
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig, load
+from taichi_mrf.session.session_core import Policy
 from taichi_mrf.tune.link import TuneOutbox
 from taichi_mrf.tune.search import Search
-from taichi_mrf.tune.session import Policy, TuneSession
+from taichi_mrf.tune.session import TuneSession
 from taichi_mrf.tune.trial import run_trial
 from taichi_mrf.viewer.messages import Bricks, File, Hello, KeyframeInfo, Notice, Quit, Request, Update
 from taichi_mrf.viewer.tune.messages import (

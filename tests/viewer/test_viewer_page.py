@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from handled_page import HandledPage
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
 
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -18,7 +19,6 @@ from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
 from taichi_mrf.viewer.transport.inbox import Joined
-from taichi_mrf.viewer.transport.server import start_server
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
@@ -31,18 +31,11 @@ def keyframe(id: int, x: float = 0.0, state: m.KeyframeState = "on") -> m.Keyfra
     return m.KeyframeInfo(id, f"frame {id}", T, CAMERA, 1, state, picture, crossed)
 
 
-class HandledPage:
-    """A page whose items are handled here, one by one; ``asked`` is what it asked of the mapping process."""
+class LivePage(HandledPage):
+    """The live page with two keyframes."""
 
     def __init__(self) -> None:
-        self.server = start_server("127.0.0.1", 0, "Handled")
-        self.asked: list[m.Request] = []
-        self.page = Page(self.server, self.asked.append)
-        self.take(HELLO, keyframe(0), keyframe(1, 1.0))
-
-    def take(self, *items: Any) -> None:
-        for item in items:
-            self.page.handlers[type(item)](item)
+        super().__init__(Page, HELLO, keyframe(0), keyframe(1, 1.0))
 
     def act(self, action: Action, client: int = 0) -> None:
         self.page.actions[action](client)
@@ -54,26 +47,26 @@ class HandledPage:
 
 
 @pytest.fixture
-def handled() -> Iterator[HandledPage]:
-    running = HandledPage()
+def handled() -> Iterator[LivePage]:
+    running = LivePage()
     yield running
     running.server.stop()
 
 
 @pytest.fixture
-def browser(handled: HandledPage) -> Iterator[RawClient]:
+def browser(handled: LivePage) -> Iterator[RawClient]:
     with raw_client(handled.server.get_port()) as client:
         client.say(camera_message())
         yield client
 
 
-def gizmo_x(handled: HandledPage) -> float:
+def gizmo_x(handled: LivePage) -> float:
     gizmo = handled.page.keyframes.gizmo
     assert gizmo is not None
     return float(gizmo.position[0])
 
 
-def test_the_gizmo_goes_where_its_keyframe_is_put(handled: HandledPage) -> None:
+def test_the_gizmo_goes_where_its_keyframe_is_put(handled: LivePage) -> None:
     handled.act(Action.TOGGLE_GIZMO)
     assert gizmo_x(handled) == 0.0
     handled.take(keyframe(0, 3.0))
@@ -82,7 +75,7 @@ def test_the_gizmo_goes_where_its_keyframe_is_put(handled: HandledPage) -> None:
     assert gizmo_x(handled) == 3.0
 
 
-def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: HandledPage) -> None:
+def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: LivePage) -> None:
     handled.act(Action.TOGGLE_GIZMO)
     handled.take(Dragged(True), keyframe(0, 3.0))
     assert gizmo_x(handled) == 0.0
@@ -91,7 +84,7 @@ def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: HandledPage) -> No
     assert [type(request) for request in handled.asked] == [m.Move]
 
 
-def test_a_frozen_keyframe_cannot_be_changed(handled: HandledPage) -> None:
+def test_a_frozen_keyframe_cannot_be_changed(handled: LivePage) -> None:
     page = handled.page
     handled.act(Action.TOGGLE_GIZMO)
     handled.take(keyframe(0, state="frozen"))
@@ -111,13 +104,13 @@ def test_a_frozen_keyframe_cannot_be_changed(handled: HandledPage) -> None:
     assert handled.asked == [m.Switch(0, on=False)]
 
 
-def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: HandledPage) -> None:
+def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> None:
     assert "Freeze" in handled.page.panel._edits.options
     handled.take(replace(HELLO, can_freeze=False))
     assert list(handled.page.panel._edits.options) == ["On/off", "Move", "Put back"]
 
 
-def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: HandledPage) -> None:
+def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: LivePage) -> None:
     panel = handled.page.panel
     assert list(panel._run.options) == ["Play", "Pause", "Step", "Reset"]
     handled.take(replace(HELLO, has_frames=False))
@@ -126,7 +119,7 @@ def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: HandledPage) -> 
     assert not panel._page_options.handles["follow"].visible
 
 
-def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: HandledPage) -> None:
+def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> None:
     speed = handled.page.panel.speed
     status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
     for factor, name in ((None, None), (2.0, "2x"), (3.0, "3x")):
@@ -134,14 +127,14 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: HandledPage) ->
         assert (speed.value if speed.visible else None) == name
 
 
-def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: HandledPage) -> None:
+def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
     colors = handled.page.panel._map_options.handles["color_by"]
     assert list(colors.options) == ["marginal", "height", "uncertainty", "keyframes"]
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
     assert list(colors.options) == ["marginal", "height", "uncertainty", "photo"]
 
 
-def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawClient) -> None:
+def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClient) -> None:
     client = handled.client_id()
     handled.act(Action.RESET, client)
     question = browser.hear_type("GuiModalMessage")["uuid"]
@@ -158,7 +151,7 @@ def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawCl
     assert handled.asked == [m.Reset()]
 
 
-def test_freeze_asks_before_it_acts(handled: HandledPage, browser: RawClient) -> None:
+def test_freeze_asks_before_it_acts(handled: LivePage, browser: RawClient) -> None:
     client = handled.client_id()
     handled.act(Action.FREEZE, client)
     question = browser.hear_type("GuiModalMessage")["uuid"]
@@ -173,7 +166,7 @@ def test_freeze_asks_before_it_acts(handled: HandledPage, browser: RawClient) ->
     assert handled.asked == [m.Freeze(0)]
 
 
-def test_an_empty_map_is_reset_at_once(handled: HandledPage, browser: RawClient) -> None:
+def test_an_empty_map_is_reset_at_once(handled: LivePage, browser: RawClient) -> None:
     handled.take(HELLO)
     handled.act(Action.RESET, handled.client_id())
     assert handled.asked == [m.Reset()]
@@ -186,7 +179,7 @@ def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:
     )
 
 
-def test_a_ray_fills_in_its_pixel(handled: HandledPage) -> None:
+def test_a_ray_fills_in_its_pixel(handled: LivePage) -> None:
     handled.take(answer(0, (3, 4)))
     assert handled.page.panel.pixel.value == (3.0, 4.0)
     handled.act(Action.SHOW_PIXEL_RAY)
@@ -195,7 +188,7 @@ def test_a_ray_fills_in_its_pixel(handled: HandledPage) -> None:
     assert handled.page.panel.pixel.value == (3.0, 4.0)
 
 
-def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: HandledPage) -> None:
+def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage) -> None:
     handled.act(Action.TOGGLE_GIZMO)
     handled.take(answer(1, (3, 4)))
     assert handled.page.keyframes.chosen == 0
@@ -203,14 +196,14 @@ def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: HandledPa
     assert handled.page.panel.pixel.value == (0.0, 0.0)
 
 
-def follow(handled: HandledPage, on: bool = True) -> None:
+def follow(handled: LivePage, on: bool = True) -> None:
     handled.page.panel._page_options.handles["follow"].value = on
     before, handled.page.options = handled.page.options, handled.page.panel.options()
     handled.page.options_changed(before)
 
 
 def test_a_browser_that_connects_while_the_view_follows_follows_too(
-    handled: HandledPage, browser: RawClient
+    handled: LivePage, browser: RawClient
 ) -> None:
     handled.take(m.CurrentCamera("frame 1", keyframe(1, 1.0).T_world_camera, CAMERA))
     follow(handled)
@@ -222,7 +215,7 @@ def test_a_browser_that_connects_while_the_view_follows_follows_too(
     np.testing.assert_allclose(handled.server.get_clients()[client].camera.look_at, [1.0, 0.0, 2.0])
 
 
-def test_the_baseline_does_not_discard_the_viewpoint(handled: HandledPage, browser: RawClient) -> None:
+def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser: RawClient) -> None:
     client = handled.client_id()
     handled.take(Joined(client))
     handled.page.viewpoint.map_grew(np.zeros(3), np.ones(3))
@@ -240,7 +233,7 @@ def test_the_baseline_does_not_discard_the_viewpoint(handled: HandledPage, brows
 
 
 def test_a_browser_that_sends_no_picture_keeps_nobody_waiting(
-    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+    handled: LivePage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither the other browsers, nor its own other downloads; and it is asked once."""
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
@@ -272,12 +265,12 @@ def in_turn(*kinds: str) -> Any:
     return lambda message: message["type"] in kinds
 
 
-def drained(handled: HandledPage) -> list[Any]:
+def drained(handled: LivePage) -> list[Any]:
     return handled.page.inbox.wait(0.0)
 
 
 def test_so_many_pictures_are_awaited_and_no_more(
-    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+    handled: LivePage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
     monkeypatch.setattr(downloads, "PICTURES_AT_ONCE", 1)
@@ -288,7 +281,7 @@ def test_so_many_pictures_are_awaited_and_no_more(
 
 
 def test_a_page_is_made_once_however_often_it_is_asked_for(
-    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+    handled: LivePage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client, held, made = handled.client_id(), threading.Event(), []
 
@@ -309,11 +302,11 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
     browser.hear_type("FileTransferStartDownload")
 
 
-def nodes(handled: HandledPage) -> set[str]:
+def nodes(handled: LivePage) -> set[str]:
     return {name for name in handled.server.scene._handle_from_node_name if name.startswith("/keyframes/")}
 
 
-def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: HandledPage) -> None:
+def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: LivePage) -> None:
     lidar = SphericalCamera(np.linspace(0.5, -0.5, 6), np.linspace(3.0, -3.0, 20))
     ring = replace(keyframe(1, 1.0), camera=lidar, picture=np.full((6, 20, 3), 90, np.uint8))
     handled.take(ring)
@@ -329,7 +322,7 @@ def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: HandledPa
     assert nodes(handled) == set()
 
 
-def test_a_browser_begins_behind_the_camera_that_is_followed(handled: HandledPage) -> None:
+def test_a_browser_begins_behind_the_camera_that_is_followed(handled: LivePage) -> None:
     viewpoint, start = handled.page.viewpoint, handled.server.initial_camera
     viewpoint.map_grew(np.zeros(3), np.ones(3))
     whole = start.position, start.look_at

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Clicked
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
-from taichi_mrf.viewer.transport.server import start_server
 
 VOXEL = 0.1
 HELLO = m.Hello(
@@ -56,19 +56,13 @@ def patch(colors: np.ndarray | None = None, empty: bool = False) -> m.SurfacePat
     )
 
 
-class SurfacePage:
-    """A page without a mapping process; ``asked`` is what it asked of it."""
+class SurfacePage(HandledPage):
+    """The live page of a map of one brick."""
 
     def __init__(self) -> None:
-        self.server = start_server("127.0.0.1", 0, "Surface")
-        self.asked: list[m.Request] = []
-        self.page = Page(self.server, self.asked.append)
-        self.take(HELLO)
+        super().__init__(Page, HELLO)
         brick, packed = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
         self.take(m.Bricks("map", brick, packed, np.ones((1, 512), np.uint8), brick[:0]))
-
-    def take(self, update: m.Update | Clicked) -> None:
-        self.page.handlers[type(update)](update)
 
     def draw(self, **options: object) -> str:
         """Draw with these options; the line of counts."""

@@ -5,32 +5,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
 from taichi_mrf.viewer.scene.options import ViewOptions
-from taichi_mrf.viewer.transport.server import start_server
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
 START_S = 1.7e9
 NOTHING = np.zeros((0, 3), np.int32)
 
 
-class TimePage:
-    """A page of a dated map; ``asked`` is what it asked of the mapping process."""
+class TimePage(HandledPage):
+    """The live page of a dated map."""
 
     def __init__(self) -> None:
-        self.server = start_server("127.0.0.1", 0, "Time")
-        self.asked: list[m.Request] = []
-        self.page = Page(self.server, self.asked.append)
+        super().__init__(Page, HELLO)
         self.time = self.page.panel.time
-        self.take(HELLO)
-
-    def take(self, *updates: m.Update) -> None:
-        for update in updates:
-            self.page.handlers[type(update)](update)
 
     def span(self, now_s: float, first_s: float = 0.0, shown_s: float | None = None) -> None:
         shown = None if shown_s is None else START_S + shown_s

@@ -5,11 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from handled_page import HandledPage
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.transport.inbox import Used
-from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.page import TunePage
 from taichi_mrf.viewer.tune.panel import Action, KnobMoved
@@ -21,19 +20,15 @@ SCORES = Scores(0.5, 0.5, 0.5, 0.1, 0.1, 0.1, 1.0, 0.1, float("nan"), 1.0, 10, 2
 TUNING = t.Tuning("a recording", "cpu", "", FIRST, t.FrameChoice(), 9, ("a", "b"), ("c", "d"), ())
 
 
-class HandledTunePage:
-    """A page whose items are handled here; ``asked`` is what it asked of the tuning process."""
+class HandledTunePage(HandledPage):
+    """The tuning page with its first try."""
 
     def __init__(self) -> None:
-        self.server = start_server("127.0.0.1", 0, "Handled")
-        self.asked: list[m.Request] = []
-        self.page = TunePage(self.server, self.asked.append)
-        self.take(TUNING, t.Tried(0, FIRST, SCORES, "start"))
+        super().__init__(TunePage, TUNING, t.Tried(0, FIRST, SCORES, "start"))
 
     def take(self, *items: Any) -> None:
         """Handle items that came together."""
-        for item in items:
-            self.page.handlers[type(item)](item)
+        super().take(*items)
         self.page.batch_done()
 
     def slider(self, name: str) -> Any:

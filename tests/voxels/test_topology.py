@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -157,9 +158,8 @@ def test_the_bound_is_an_error_in_metres(topology: Topology, axis: int, sign: in
     at_edge[0, axis] = half - 1 if sign > 0 else -half
     topology.check(at_edge, 0.02)
     metres = half * BRICK * 0.02 * (1 if isinstance(topology, SparseTopology) else 2)
-    with pytest.raises(CapacityError, match=f" {metres:g} m") as caught:
+    with refusal(CapacityError, f" {metres:g} m"):
         topology.check(np.concatenate([at_edge, at_edge + sign * np.eye(3, dtype=np.int32)[[axis]]]), 0.02)
-    assert "\n" not in str(caught.value)
     topology.check(np.zeros((0, 3), np.int32), 0.02)
 
 

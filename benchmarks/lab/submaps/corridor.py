@@ -20,8 +20,7 @@ from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.submaps.job import Job, Sequence
-from taichi_mrf.submaps.plan import Plan, Submap
+from taichi_mrf.submaps.plan import Job, Plan, SourceFrames, Submap
 from taichi_mrf.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -71,7 +70,7 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
     """Map the corridor both ways, and compare after each round."""
     source = f"{NAME}?rooms={ROOMS}&frames={frames}&width={WIDTH}&height={HEIGHT}"
     config = Config(voxel_size, evaluation=EvaluationConfig(hold_out=0))
-    sequence = Sequence(source, SourceFlags().keywords())
+    sequence = SourceFrames(source, SourceFlags().keywords())
     begin = time.perf_counter()
     single = map_sequence(sequence.open(), config).map
     single_seconds = time.perf_counter() - begin
@@ -141,7 +140,7 @@ def _settled_after(result: SubmapsResult) -> int:
 def _cost(config: Config, result: SubmapsResult, single: OccupancyMap, path: Path) -> MeasuredCost:
     """What a keyframe of a real camera costs, and what the corridor's map takes."""
     source = f"{NAME}?rooms=2&frames={FULL_FRAMES}&width={FULL_WIDTH}&height={FULL_HEIGHT}"
-    dataset = Sequence(source, SourceFlags().keywords()).open()
+    dataset = SourceFrames(source, SourceFlags().keywords()).open()
     m = create_map(config, dataset.camera)
     assert has_messages(m)
     for index in range(len(dataset)):

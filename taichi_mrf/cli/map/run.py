@@ -1,38 +1,46 @@
-"""Command ``taichi-mrf map``: map a sequence, check the map, write the files, print the report."""
+"""Command ``taichi-mrf map``: map sequences, check the maps, write the files, print the reports.
 
-import math
+One driver holds the folder and the signals. One sequence is mapped in this process, several, or any on a
+cluster, by processes of their own, and one too large for a machine in submaps.
+"""
+
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from taichi_mrf.calibration.from_recording import LearntSigma, sigma_of_glance
-from taichi_mrf.cli.map.earlier import refuse_other_run
-from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
-from taichi_mrf.cli.map.task import MapTask, map_task
+import taichi_mrf
+from taichi_mrf.cli.map.keep import refuse_changes
+from taichi_mrf.cli.map.sequence import Outcome, finished_before, map_in_process, map_to_folder
+from taichi_mrf.cli.map.summary import (
+    SUMMARY_CSV,
+    SUMMARY_JSON,
+    SUMMARY_PICTURE,
+    Row,
+    folder_names,
+    print_summary,
+    summary_csv,
+    summary_json,
+    summary_line,
+    summary_row,
+    tiles,
+)
+from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
-from taichi_mrf.cli.shared.learn_noise import learn_noise
+from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
-from taichi_mrf.config.registry import METHODS
-from taichi_mrf.config.schema import Config
-from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.datasets.summary import note_unused_color
-from taichi_mrf.doctor.diagnosis import mistakes
-from taichi_mrf.errors import collected_warnings
-from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
-from taichi_mrf.mapping.rounds import RoundStep
-from taichi_mrf.mapping.tracking import wants_color
-from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE
-from taichi_mrf.runs.folder import RunFacts, write_run
-from taichi_mrf.runs.noise import contradicts
+from taichi_mrf.cluster.choose import open_runner
+from taichi_mrf.config.schema import load
+from taichi_mrf.config.text import commented_yaml, differences
+from taichi_mrf.errors import ClusterError, TaichiMRFError
+from taichi_mrf.evaluation.pictures.contact_sheet import write_contact_sheet
+from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
-from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import write_text
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
@@ -40,31 +48,171 @@ LIVE_VIEW = "shows the map in the browser."
 
 
 def run_map(options: Map) -> int:
-    """Carry out the command for one source; returns the exit status. Raises TaichiMRFError."""
+    """Carry out the command; returns the exit status. Raises TaichiMRFError, also after everything is written
+    if a sequence has failed."""
     console = open_terminal(options.printing, stderr=options.json)
-    task = map_task(options, options.sources[0], options.out)
+    several, in_submaps = len(options.sources) > 1, options.submap_size is not None
+    here = not (several or in_submaps or options.scheduler is not None)
+    work = _map_here if here else _map_in_processes
+    if in_submaps:
+        from taichi_mrf.cli.map.submaps import map_submaps as work
+    signals = stop_on_signals if here else interrupt_on_signals
     with (
-        output_folder(task.out),
-        stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,
+        # The task of one sequence on a cluster locks the folder itself.
+        output_folder(options.out, locked=here or several or in_submaps),
+        signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
-        finished = refuse_other_run(task)
-        if finished is not None:
-            _print_finished(console, options, finished)
-            return 0
-        tell_first_run(options.printing)
-        with ProgressBar(console, options.printing) as progress:
-            report, written = map_to_folder(task, progress, request)
-        print_run(console, options, report, written)
-    if report["did_not_fit"] is not None and request.signal is None:
-        saved = f"the map of {report['keyframes']} keyframes was saved to {options.out}"
-        print_problem(f"{report['did_not_fit']}; {saved}; --resume continues it")
-    return exit_status(request, report["did_not_fit"])
+        return work(options, console, request)
 
 
-def _print_finished(console: Terminal, options: Map, report: dict[str, Any]) -> None:
+def _map_here(options: Map, console: Terminal, request: StopRequest) -> int:
+    """Map one sequence in this process; returns the exit status."""
+    task = map_task(options, options.sources[0], options.out)
+    finished = refuse_other_run(task)
+    if finished is not None:
+        if options.json:
+            print(report_json(finished), end="")
+        console.print_line(f"{options.out} holds this run already, finished; --overwrite maps it again.")
+        return 0
+    tell_first_run(options.printing)
+    with ProgressBar(console, options.printing) as progress:
+        report, written = map_to_folder(task, progress, request)
+    print_run(console, options, report, written)
+    if request() or report["did_not_fit"] is None:
+        return request.exit_status
+    saved = f"the map of {report['keyframes']} keyframes was saved to {options.out}"
+    print_problem(f"{report['did_not_fit']}; {saved}; --resume continues it")
+    return DID_NOT_FIT
+
+
+@dataclass
+class _Batch:
+    """The tasks of a command and their outcomes, by the task's index."""
+
+    options: Map
+    names: list[str]
+    tasks: list[MapTask]
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        """A row for each sequence, in the order in which they were named."""
+        return [self.row(number) for number in range(len(self.tasks))]
+
+    def row(self, number: int) -> Row:
+        """The row of one sequence."""
+        outcome = self.outcomes.get(number, Outcome("not done"))
+        return summary_row(self.names[number], self.tasks[number].source, outcome)
+
+
+def _map_in_processes(options: Map, console: Terminal, request: StopRequest) -> int:
+    """Map each sequence in a process of its own, here or on a cluster; returns the exit status. Raises
+    TaichiMRFError, also after everything is written if a sequence has failed."""
+    start = time.perf_counter()
+    names = folder_names(options.sources)
+    single = len(names) == 1
+    folders = [options.out] if single else [options.out / name for name in names]
+    tasks = [map_task(options, *each) for each in zip(options.sources, folders, strict=True)]
+    batch = _Batch(options, names, tasks)
+    _map_all(batch, console, request)
+    if not single:
+        _print_all(batch, console, time.perf_counter() - start)
+    elif 0 in batch.outcomes:
+        _print_single(batch, console)
+    failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
+    if request() or not failed:
+        return request.exit_status
+    if single and _did_not_fit(batch.outcomes.get(0)):  # the report says so
+        return DID_NOT_FIT
+    problem = failed[0].error or failed[0].status
+    first = problem if single else f"{failed[0].name}: {problem}"
+    others = "" if single else f"{len(failed)} of {len(tasks)} sequences failed, the first: "
+    raise TaichiMRFError(f"{others}{first}")
+
+
+def _did_not_fit(outcome: Outcome | None) -> bool:
+    """True if memory ran out, and the map so far was saved."""
+    return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
+
+
+def _map_all(batch: _Batch, console: Terminal, request: StopRequest) -> None:
+    """Run the tasks and fill in their outcomes, until the user stops the run."""
+    count = len(batch.tasks)
+    with ProgressBar(console, batch.options.printing) as bar:
+
+        def done(number: int, outcome: Outcome) -> None:
+            batch.outcomes[number] = outcome
+            if console.is_terminal:  # elsewhere the lines below show the same
+                bar.advance("Mapping", len(batch.outcomes), count)
+            line = f"[{len(batch.outcomes)}/{count}] {summary_line(batch.row(number))}"
+            console.print_line(line)
+
+        if console.is_terminal:
+            bar.advance("Mapping", 0, count)
+        waiting: list[int] = []
+        try:
+            with request.ending(), open_runner(batch.options.jobs, batch.options.scheduler) as runner:
+                waiting = _waiting(batch, done)
+                tasks = [batch.tasks[number] for number in waiting]
+                runner.run(map_in_process, tasks, lambda index, outcome: done(waiting[index], outcome))
+        except ClusterError as error:
+            if not error.lost:
+                raise
+            for index, what in error.lost.items():
+                done(waiting[index], Outcome("failed", error=what))
+
+
+def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
+    """The tasks that are not finished: with --overwrite all, for which an old report must not pass for a
+    finished run. Raises ConfigError for folders that hold other runs."""
+    if len(batch.tasks) > 1:
+        path, settings = batch.options.out / CONFIG_FILE, batch.tasks[0].settings
+        if path.is_file() and not batch.options.overwrite:
+            refuse_changes(path, differences(load(path), settings))
+        write_text(path, commented_yaml(settings))
+    waiting = []
+    for number, task in enumerate(batch.tasks):
+        if batch.options.overwrite:
+            (task.out / REPORT_FILE).unlink(missing_ok=True)
+        refuse_other_run(task)
+        outcome = finished_before(task)
+        if outcome is None:
+            waiting.append(number)
+        else:
+            done(number, outcome)
+    return waiting
+
+
+def _print_single(batch: _Batch, console: Terminal) -> None:
+    outcome, out = batch.outcomes[0], batch.options.out
+    if outcome.report is not None:
+        written = sorted(path for path in out.iterdir() if path.is_file() and not path.name.startswith("."))
+        print_run(console, batch.options, outcome.report, written)
+
+
+def _print_all(batch: _Batch, console: Terminal, seconds: float) -> None:
+    """Write and print the summary."""
+    options, rows = batch.options, batch.rows()
+    facts = {
+        "version": taichi_mrf.__version__,
+        "jobs": options.jobs,
+        "scheduler": options.scheduler,
+        "seconds": round(seconds, 3),
+    }
+    text = summary_json(rows, facts)
+    written = [options.out / SUMMARY_JSON, options.out / SUMMARY_CSV]
+    write_text(written[0], text)
+    write_text(written[1], summary_csv(rows))
+    if options.pictures:
+        written.append(options.out / SUMMARY_PICTURE)
+        write_contact_sheet(written[-1], tiles(rows, [task.out for task in batch.tasks]))
     if options.json:
-        print(report_json(report), end="")
-    console.print_line(f"{options.out} holds this run already, finished; --overwrite maps it again.")
+        print(text, end="")
+        return
+    print_summary(console, rows)
+    if any(row.status in ("stopped", "not done") for row in rows):
+        console.print_line("Stopped before the end; --resume continues from here.", "yellow")
+    for path in written:
+        console.print_line(str(path))
 
 
 def print_run(console: Terminal, options: Map, report: dict[str, Any], written: list[Path]) -> None:
@@ -78,105 +226,9 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
     console.print(f"{look} {OPEN_VOXELS} {live}")
 
 
-def map_to_folder(
-    task: MapTask, progress: ProgressBar, request: StopRequest
-) -> tuple[dict[str, Any], list[Path]]:
-    """Map one sequence and write its files into its folder, which exists; returns the report and the files.
-
-    A run that the ``request`` stopped says so in its report; one that has to end within seconds is neither
-    checked nor drawn. Raises TaichiMRFError.
-    """
-    start = time.perf_counter()
-    settings = task.settings
-    runtime.init(settings.runtime.arch, settings.runtime.threads)
-    dataset = task.open(wants_color(settings, task.source, task.poses.track_poses))
-    if not settings.color and METHODS[settings.method].has_colors:
-        note_unused_color(dataset, task.source, task.reading)
-    settings = with_recorded_noise(settings, dataset)
-    previous = resumed_map(task.out, settings) if task.resume else None
-    skipped = skipped_before(task.out) if task.resume else {}
-    opening = time.perf_counter() - start
-
-    with collected_warnings() as warned:
-        start = time.perf_counter()
-        learnt = _learn_noise(task, dataset, settings, progress, request)
-        if learnt is not None:
-            settings = learnt.put_into(settings)
-        took = time.perf_counter() - start
-        learning = {"learning noise": took} if took > 0.05 else {}  # most recordings are not looked at
-        facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned, learnt)
-        result = map_sequence(
-            dataset,
-            settings,
-            listener_of(progress),
-            every=task.every,
-            limit=task.limit,
-            skip_bad_frames=task.skip_bad_frames,
-            should_stop=request,
-            out_of_time=request.out_of_time,
-            resume_from=previous,
-            keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
-            map_path=task.out / MAP_FILE,
-        )
-        result.seconds = {"opening": opening, **learning, **result.seconds}
-        return write_run(
-            task.out, result, facts, pictures=task.pictures,
-            haste=request, advance=progress.advance,
-        )  # fmt: skip
-
-
-def _learn_noise(
-    task: MapTask, dataset: Dataset, settings: Config, progress: ProgressBar, request: StopRequest
-) -> LearntSigma | None:
-    """Noise learnt from the recording, if that was asked for, or if it contradicts the default. A resumed run
-    has learnt it."""
-    if task.resume and (task.out / CONFIG_FILE).is_file():
-        return None
-    learnt = None
-    if task.noise.is_learnt:
-        learnt = learn_noise(dataset, settings, progress, request, task.every, task.limit)
-    elif task.noise.is_checked and not task.poses.follow:
-        learnt = sigma_of_glance(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
-    # No noise is learnt from a recording that is not what it is taken for. The check of the map says so, too.
-    found = mistakes(dataset) if contradicts(learnt) else []
-    if found and not settings.evaluation.hold_out:
-        dataset.notes.append(f"frames contradict each other: {'; '.join(found)}")
-    return None if found else learnt
-
-
-def listener_of(progress: ProgressBar) -> Listener:
-    """Listener that shows the events of the pipeline."""
-
-    def listen(event: Event) -> None:
-        if isinstance(event, FrameOffered):
-            progress.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
-        elif isinstance(event, WaitingForPoses):
-            progress.advance("Waiting for poses", round(event.quiet_s), math.ceil(event.final_s))
-        elif isinstance(event, RoundStep):
-            done = (event.round - 1) * event.keyframes + event.moved
-            progress.advance("Aligning", done, event.rounds * event.keyframes, 1)
-        else:
-            done = (event.sweep - 1) * event.keyframes + event.keyframe
-            progress.advance("Inferring", done, event.sweeps * event.keyframes, 1)
-
-    return listen
-
-
-def exit_status(request: StopRequest, did_not_fit: str | None = None) -> int:
-    """0, or what a shell expects of a program that was stopped by a signal, or DID_NOT_FIT."""
-    if request.signal is not None:
-        return 128 + request.signal
-    return 0 if did_not_fit is None else DID_NOT_FIT
-
-
 def print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:
     """The report as a table, then what should be known besides, then where the files lie."""
-    table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for name, text in _report_rows(report):
-        table.add_row(name, text)
-    console.print(table)
+    print_facts(console, f"Map of {report['source']}", _report_rows(report))
     for note in report["notes"]:
         console.print_line(f"Note: {note}")
     for problem in report["skipped_frames"].values():

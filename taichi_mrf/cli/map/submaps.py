@@ -3,14 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 import taichi_mrf
-from taichi_mrf.cli.map.run import exit_status
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.shared.interrupt import interrupt_on_signals
-from taichi_mrf.cli.shared.output import output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.interrupt import StopRequest
+from taichi_mrf.cli.shared.print_table import print_facts
+from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import with_absolute_tables
@@ -20,8 +17,8 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
-from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.picture import write_submap_picture
+from taichi_mrf.submaps.plan import SourceFrames
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.libraries import library
@@ -30,9 +27,9 @@ from taichi_mrf.voxels.layout import VOXELS
 TASK_FOLDER, MAP_FOLDER, PICTURE_FILE = "submaps", "map.zarr", "submaps.png"
 
 
-def run_submaps(options: Map, submap_size: float) -> int:
-    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = open_terminal(options.printing, stderr=options.json)
+def map_submaps(options: Map, console: Terminal, request: StopRequest) -> int:
+    """Map one sequence in submaps; returns the exit status. Raises TaichiMRFError."""
+    assert options.submap_size is not None
     if len(options.sources) != 1:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
@@ -40,39 +37,34 @@ def run_submaps(options: Map, submap_size: float) -> int:
     library("zarr", "maps in chunks need", "store")  # fails before the work, not after it
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
-    sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
+    sequence = SourceFrames(source, options.reading.keywords(), options.every, options.limit)
+    if not options.resume:  # which takes its parameters from here
+        _refuse_to_replace(options)
+        (options.out / REPORT_FILE).unlink(missing_ok=True)
+        write_text(options.out / CONFIG_FILE, commented_yaml(settings))
+    result = None
     with (
-        output_folder(options.out),
-        interrupt_on_signals(lambda text: console.print_line(text, "yellow")) as request,
+        request.ending(),
+        ProgressBar(console, options.printing) as progress,
+        open_runner(options.jobs, options.scheduler) as runner,
     ):
-        if not options.resume:  # which takes its parameters from here
-            _refuse_to_replace(options)
-            (options.out / REPORT_FILE).unlink(missing_ok=True)
-            write_text(options.out / CONFIG_FILE, commented_yaml(settings))
-        try:
-            with (
-                ProgressBar(console, options.printing) as progress,
-                open_runner(options.jobs, options.scheduler) as runner,
-            ):
-                result = map_in_submaps(
-                    sequence,
-                    settings,
-                    submap_size,
-                    options.out / TASK_FOLDER,
-                    options.out / MAP_FOLDER,
-                    runner,
-                    rounds=options.rounds,
-                    resume=options.resume,
-                    skip_bad_frames=options.skip_bad_frames,
-                    progress=progress.advance,
-                )
-        except KeyboardInterrupt:
-            if request.aborted or not request():
-                raise
-            console.print_line("Stopped before the end; --resume continues from here.", "yellow")
-            return exit_status(request)
+        result = map_in_submaps(
+            sequence,
+            settings,
+            options.submap_size,
+            options.out / TASK_FOLDER,
+            options.out / MAP_FOLDER,
+            runner,
+            rounds=options.rounds,
+            resume=options.resume,
+            skip_bad_frames=options.skip_bad_frames,
+            progress=progress.advance,
+        )
+    if result is None:
+        console.print_line("Stopped before the end; --resume continues from here.", "yellow")
+    else:
         _print_result(console, options, result, _write(options, result))
-    return exit_status(request)
+    return request.exit_status
 
 
 def _refuse_to_replace(options: Map) -> None:
@@ -136,22 +128,16 @@ def _print_result(console: Terminal, options: Map, result: SubmapsResult, writte
         print(report_json(report), end="")
         return
     largest, moved = report["largest_task"], result.rounds[-1].moved
-    seconds = ", ".join(f"{stage} {value:.1f}" for stage, value in report["seconds"].items())
-    table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    table.add_row("keyframes", f"{report['keyframes']}, each in {report['overlap']:.2f} submaps")
-    table.add_row(
-        "submaps", f"{report['submaps']}, the largest with {largest['keyframes']} keyframes and "
-        f"{largest['map_memory_mb']:.0f} MB",
-    )  # fmt: skip
-    table.add_row("voxels", f"{report['voxels']:,} of {report['voxel_size']} m")
-    table.add_row(
-        "rounds", f"{len(result.rounds) - 1} of exchange"
-        + ("" if moved is None else f"; {moved:.3%} of the voxels moved in the last"),
-    )  # fmt: skip
-    table.add_row("seconds", seconds)
-    console.print(table)
+    size = f"{largest['keyframes']} keyframes and {largest['map_memory_mb']:.0f} MB"
+    in_the_last = "" if moved is None else f"; {moved:.3%} of the voxels moved in the last"
+    facts = [
+        ("keyframes", f"{report['keyframes']}, each in {report['overlap']:.2f} submaps"),
+        ("submaps", f"{report['submaps']}, the largest with {size}"),
+        ("voxels", f"{report['voxels']:,} of {report['voxel_size']} m"),
+        ("rounds", f"{len(result.rounds) - 1} of exchange{in_the_last}"),
+        ("seconds", ", ".join(f"{stage} {value:.1f}" for stage, value in report["seconds"].items())),
+    ]
+    print_facts(console, f"Map of {report['source']}", facts)
     for problem in report["skipped_frames"].values():
         console.print_line(f"Skipped: {problem}")
     for path in written:

@@ -15,9 +15,7 @@ from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.time import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.factor_graph.config import LaserConfig
-
-CONFIG_FILE = "config.yaml"
-"""Name of the effective configuration in the folder of a run."""
+from taichi_mrf.runs.files import CONFIG_FILE
 
 
 @dataclass(frozen=True)

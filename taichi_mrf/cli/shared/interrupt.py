@@ -20,9 +20,6 @@ from taichi_mrf.errors import CutShortError
 INFER_SECONDS = 3.0
 """How long after SIGTERM a map may still be inferred: containers kill after 10 s, and it has to be saved."""
 
-_TELL_SECONDS = 0.2
-"""How long to wait until the user is told, so that this line comes before those that follow."""
-
 _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
@@ -39,6 +36,11 @@ class StopRequest:
 
     def __call__(self) -> bool:
         return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """0, or what a shell expects of a program that was stopped by a signal."""
+        return 0 if self.signal is None else 128 + self.signal
 
     @property
     def hurried(self) -> bool:
@@ -60,6 +62,15 @@ class StopRequest:
             yield
         finally:
             self._cuts_short = False
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """For a block in which this process waits for others: the first signal ends it, and no more."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            if self.aborted or not self():
+                raise
 
     def take(self, number: int) -> bool:
         """Note a signal; returns whether it changes anything. Raises KeyboardInterrupt if it aborts."""

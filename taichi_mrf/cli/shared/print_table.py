@@ -1,4 +1,6 @@
-"""A table of results on the terminal."""
+"""Tables of results on the terminal."""
+
+from collections.abc import Iterable
 
 from rich.measure import Measurement
 from rich.table import Table as RichTable
@@ -8,6 +10,16 @@ from taichi_mrf.evaluation.tables import Table, entry_text
 
 _WIDEST = 1000
 """Columns of text that no table needs."""
+
+
+def print_facts(console: Terminal, title: str, facts: Iterable[tuple[str, str]]) -> None:
+    """Print facts, each a name and a text, as a table without a head."""
+    table = RichTable(show_header=False, title=title, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    for name, text in facts:
+        table.add_row(name, text)
+    console.print(table)
 
 
 def print_table(console: Terminal, table: Table) -> None:

@@ -5,6 +5,8 @@ each voxel is kept, because their images are gone.
 """
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,11 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.inference.color_sums import ColorShare, ColorSums
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.inference.voxel_colors import ColorPass
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.queries.points import checked_points
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
+
+if TYPE_CHECKING:
+    from taichi_mrf.inference import voxel_colors
+else:
+    (voxel_colors,) = later("taichi_mrf.inference", "voxel_colors")
 
 
 class MapColors:
@@ -34,12 +41,16 @@ class MapColors:
         to date. ``pool`` (default: the registry's) has the beliefs."""
         self._beliefs = pool
         self._registry, self._keyframes, self._refresh = registry, keyframes, refresh
-        self._sweeper, self._pass = sweeper, ColorPass(sweeper)
+        self._sweeper = sweeper
         self.frozen = ColorShare.nothing()
         self._colors = np.zeros((0, 4), np.uint8)
         self._found_at: tuple[int, int] | None = None
         self._sums: ColorSums | None = None  # kept with follow()
         self._counted: dict[int, Keyframe] = {}
+
+    @cached_property
+    def _pass(self) -> "voxel_colors.ColorPass":
+        return voxel_colors.ColorPass(self._sweeper)
 
     def of_some(self, keyframes: Mapping[int, Keyframe], pool: BrickPool, with_frozen: bool) -> "MapColors":
         """The colours that some keyframes gave, and perhaps frozen ones, by the beliefs of ``pool``."""

@@ -9,19 +9,25 @@ counted before stay as they were, and a new keyframe costs its own rays.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.inference.surface_votes import add_votes, call_winners, count_votes
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot, copied
+
+if TYPE_CHECKING:
+    from taichi_mrf.inference import surface_votes
+else:
+    (surface_votes,) = later("taichi_mrf.inference", "surface_votes")
 
 AT_ONCE = 16
 """Keyframes whose votes are counted together: they share what their rays read of the map."""
@@ -59,7 +65,9 @@ class Decisions:
         pool = self._registry.pool
         self._count(settled, between)
         log_odds = copied(pool.belief)
-        call_winners(self._votes, log_odds, pool.prior_log_odds, self._sweeper.volume.min_evidence)
+        surface_votes.call_winners(
+            self._votes, log_odds, pool.prior_log_odds, self._sweeper.volume.min_evidence
+        )
         runtime.settle()
         return log_odds
 
@@ -98,7 +106,7 @@ class Decisions:
         self._identity = pool.identity.copy()
         if len(kept.bricks):
             slots = self._registry.topology.slots(kept.bricks)
-            add_votes(slots[slots >= 0], kept.sums[slots >= 0].reshape(-1), self._votes)
+            surface_votes.add_votes(slots[slots >= 0], kept.sums[slots >= 0].reshape(-1), self._votes)
 
     def _add(self, keyframes: Sequence[Keyframe], between: Callable[[], object]) -> None:
         """Add the votes of some keyframes' rays. Only the bricks that they see are looked at."""
@@ -108,8 +116,10 @@ class Decisions:
         places = [np.searchsorted(slots, visible.slots).astype(np.int32) for visible in lists]
         seen = [replace(visible, slots=at, arrays=None) for visible, at in zip(lists, places, strict=True)]
         model = self._sweeper.model()
-        votes = count_votes(zip(keyframes, seen, strict=True), part, model, self._sweeper.volume, between)
-        add_votes(slots, votes.to_numpy()[: len(slots) * VOXELS], self._votes)
+        votes = surface_votes.count_votes(
+            zip(keyframes, seen, strict=True), part, model, self._sweeper.volume, between
+        )
+        surface_votes.add_votes(slots, votes.to_numpy()[: len(slots) * VOXELS], self._votes)
 
     def _follow_bricks(self) -> None:
         """Forget the votes of bricks that are gone, and make room for new ones."""
@@ -121,7 +131,7 @@ class Decisions:
         kept = np.flatnonzero(before == self._identity[: len(before)]).astype(np.int32)
         votes = old.to_numpy().reshape(-1, VOXELS)[kept]
         self._votes = _zeros(pool)
-        add_votes(kept, votes.reshape(-1), self._votes)
+        surface_votes.add_votes(kept, votes.reshape(-1), self._votes)
 
 
 def _zeros(pool: BrickPool) -> "ti.Ndarray":

@@ -6,20 +6,15 @@ keyframes: their order does not matter.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference.brick_sums import BrickSums
-from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
-from taichi_mrf.inference.ray_model import RayModel
-from taichi_mrf.inference.surface_field import SurfaceRays
-from taichi_mrf.inference.surface_votes import count_votes
 from taichi_mrf.voxels.distance_field import VALUES, DistanceField
+from taichi_mrf.voxels.layers import FIRST, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
-from taichi_mrf.voxels.pool import BrickPool
 
 STEPS = 1024.0
 """Steps of the kept sums for a weight of 1: a voxel with the least weight that counts has 20."""
@@ -52,6 +47,12 @@ class RayShare:
         return RayShare(*(sums.chosen(sums.inside(chunks) == inside) for sums in both))
 
     @property
+    def layers(self) -> dict[str, BrickValues]:
+        """The distances and the votes as layers."""
+        won = (self.votes.sums[..., 0] > 0).astype(np.uint8)
+        return {SURFACE: self.field.values, FIRST: BrickValues(self.votes.bricks, won)}
+
+    @property
     def field(self) -> DistanceField:
         """The distances as signed distances."""
         sums = self.distances.sums.astype(np.float32) / np.float32(STEPS)
@@ -64,25 +65,6 @@ class KeptRays:
     def __init__(self, wanted: bool) -> None:
         """Unless it is ``wanted``, nothing is kept."""
         self.wanted, self.share = wanted, RayShare.nothing()
-
-    def freeze(
-        self,
-        keyframe: Keyframe,
-        visible: VisibleBricks,
-        pool: BrickPool,
-        models: tuple[RayModel, RayModel],
-        volume: VolumeConfig,
-    ) -> RayShare:
-        """Distances and votes of a keyframe that is about to be frozen, with the bricks that it sees now;
-        ``models`` are those of its rays for the surface and for votes."""
-        # Only the keyframe's own bricks are looked at, however large the map is.
-        part = pool.part(visible.slots)
-        seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]
-        field = SurfaceRays(part, models[0], volume).field(seen)
-        sums = np.rint(field.sums * STEPS).astype(np.int32)
-        votes = count_votes(seen, part, models[1], volume).to_numpy()[: len(visible.slots) * VOXELS]
-        bricks = pool.bricks[visible.slots]
-        return RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes.reshape(-1, VOXELS, 1)))
 
     def restore(self, share: RayShare) -> None:
         """Add what keyframes left."""

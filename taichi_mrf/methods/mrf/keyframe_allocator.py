@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import leave
-from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.incremental import change_count_seen_by
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, NoReturnRays, RayList
@@ -20,6 +20,9 @@ from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.strips import strip_length
+
+if TYPE_CHECKING:
+    from taichi_mrf.inference.dated import DatedBelief
 
 SCOUTS = 4
 """One of this many neighbouring rays is followed through free space to find the crossed bricks."""
@@ -36,7 +39,7 @@ class KeyframeAllocator:
     precision: str
     bounds: KeyframeBounds
     budget: MemoryBudget
-    dated: DatedBelief | None = None
+    dated: "DatedBelief | None" = None
     """Dated beliefs that follow the messages, if evidence has a date."""
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose, stamp_s: float) -> Keyframe:

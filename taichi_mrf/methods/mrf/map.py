@@ -1,52 +1,58 @@
 """MRFMap (Shankar & Michael, RSS 2020): keyframes in, marginal probabilities of occupancy out.
 
-The class manages keyframes, bricks and messages. The computation itself is inference/sum_product.py.
+The computation itself is inference/sum_product.py. This class names what a map can do; it is composed of
+parts (parts.py), and of functions that work on them, whose modules are loaded when they are first used.
 """
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
-from taichi_mrf.alignment.refine import Aligner
 from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
-from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
+from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.factor_graph.depth_graph import depth_graph
-from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.geometry.poses import as_pose
-from taichi_mrf.inference.incremental import IncrementalInference
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_color, checked_depth
-from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
-from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.ray_model import Limits
-from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven, sweep_steps
-from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
-from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_section
-from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
+from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven
+from taichi_mrf.methods.brick_map import BrickMap, own_parameters, own_section
+from taichi_mrf.methods.mrf import inferring
 from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.decided import Decisions
-from taichi_mrf.methods.mrf.kept_rays import KeptRays
-from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
-from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
-from taichi_mrf.methods.mrf.moving_window import MovingWindow
+from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.plug import METHOD
-from taichi_mrf.methods.mrf.posed import PosedMRF
-from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
+from taichi_mrf.methods.protocol import MapStatistics
 from taichi_mrf.queries.occlusion import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
-from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.system import tensors
+from taichi_mrf.system.later import later
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import Topology
+
+if TYPE_CHECKING:
+    from taichi_mrf.factor_graph import depth_graph
+    from taichi_mrf.methods import map_file
+    from taichi_mrf.methods.mrf import moving_window, posed, reading, storage, surfacing
+    from taichi_mrf.queries import change
+    from taichi_mrf.queries.measured_depth import MeasuredDepth
+else:
+    moving_window, posed, reading, storage, surfacing = later(
+        "taichi_mrf.methods.mrf", "moving_window", "posed", "reading", "storage", "surfacing"
+    )
+    (depth_graph,) = later("taichi_mrf.factor_graph", "depth_graph")
+    (map_file,) = later("taichi_mrf.methods", "map_file")
+    (change,) = later("taichi_mrf.queries", "change")
 
 DOUBT_FREE = 0.01
 """Lower bound on a voxel's probability where measurements are predicted, as a share of its prior: poses and
@@ -56,7 +62,7 @@ DOUBT_OCCUPIED = 0.01
 """Chance that a predicted ray passes a voxel that was seen to be occupied, however often."""
 
 
-class MRFMap(PosedMRF):
+class MRFMap(BrickMap):
     """A probabilistic occupancy map of any set of depth keyframes.
 
     Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map depends only
@@ -95,27 +101,12 @@ class MRFMap(PosedMRF):
         log_odds = log_odds_without_bricks(inference, config.voxel_size, self.LIMITS.message)
         doubt = doubting(DOUBT_FREE, DOUBT_OCCUPIED, self.prior)
         self._make_bricks(config, noise, *log_odds, config.volume, Occlusion(), doubt)
-        bundler = RayBundler(self.voxel_size, inference)
-        bounds = KeyframeBounds()
-        parts = (self.sensor, self.config.volume, self.LIMITS.precision)
-        self._keyframes: dict[int, Keyframe] = {}
-        self._date(config.time)
-        budget = MemoryBudget(self._pool, self.LIMITS.precision)
-        self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget, self._dated)
-        self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume, self.LIMITS)
-        note_sweep = None if self._dated is None else self._dated.note_sweep
-        kept = (bounds, self._allocator.look_again, self._allocator.refresh, inference.renew_tolerance)
-        self._incremental = IncrementalInference(self._pool, self._sweeper, *kept, note_sweep)
-        self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, self.sensor.max_depth))
-        self._frozen: dict[int, str] = {}
         self._next_id = 0
-        self._messages_lost = False  # a loaded map has beliefs, but no messages
-        self._settled = True
-        self._colors = MapColors(self._registry, self._keyframes, self._sweeper, self._allocator.refresh)
-        self._kept = KeptRays(config.keep_surface)
-        self._decisions = Decisions(self._registry, self._keyframes, self._kept, self._sweeper)
-        parked = (self._registry, self._dated, self.aligner.surface, self._colors, self._kept)
-        self.window = MovingWindow.of(self.config.volume, *parked)
+        self._parts = MapParts.of(self.config, self.prior, self.view, self._registry, self.LIMITS)
+        self._keyframes = self._parts.keyframes
+        self.window: moving_window.MovingWindow | None = None
+        if config.volume.window_m > 0:
+            self.window = moving_window.MovingWindow(config.volume.window_m, self._parts)
 
     @property
     def stale(self) -> bool:
@@ -126,7 +117,17 @@ class MRFMap(PosedMRF):
     def settled(self) -> bool:
         """True if the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
         stopped, and no keyframe changed since."""
-        return self._settled
+        return self._parts.settled
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]:
+        """The keyframes that can still be moved and removed, by id."""
+        return MappingProxyType(self._keyframes)
+
+    @property
+    def frozen(self) -> Mapping[int, str]:
+        """Names of the keyframes that have been frozen, by id."""
+        return MappingProxyType(self._parts.frozen)
 
     def add_keyframe(
         self,
@@ -157,12 +158,13 @@ class MRFMap(PosedMRF):
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        image = self._upload(depth_m, camera, color, noise, sigma_m, no_return, pose_covariance)
-        keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
+        given = (color, noise, sigma_m, no_return, pose_covariance)
+        image = self._parts.image(self.noise, depth_m, camera, *given)
+        keyframe = self._parts.allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
         self._next_id += 1
-        self._settled = False
+        self._parts.settled = False
         if self.window is not None:
             self.window.follow(self, T[:3, 3])
         return keyframe.id
@@ -170,11 +172,86 @@ class MRFMap(PosedMRF):
     def remove_keyframe(self, id: int) -> None:
         """Remove a keyframe, its messages, and every brick that no other keyframe owns. Raises
         KeyframeError."""
-        keyframe = self._find(id)
-        self._restore_messages()
-        self._allocator.take_out(keyframe)
+        keyframe = self._parts.find(id)
+        inferring.restore_messages(self._parts)
+        self._parts.allocator.take_out(keyframe)
         del self._keyframes[id]
-        self._settled = False
+        self._parts.settled = False
+
+    def move_keyframe(
+        self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
+    ) -> None:
+        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped.
+
+        ``pose_covariance`` (6, 6) is that of the new pose, as in :meth:`add_keyframe`, zeros if it is exact.
+        Without it the keyframe keeps the covariance that it has. Raises KeyframeError, or CapacityError if
+        there is not enough memory; the map is then unchanged.
+        """
+        posed.move_keyframe(self._parts, id, T_world_camera, pose_covariance)
+
+    def update_poses(
+        self,
+        poses: Mapping[int, ArrayLike],
+        least: float = 0.1,
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        covariances: Mapping[int, ArrayLike] | None = None,
+    ) -> "posed.PoseUpdate":
+        """Take in the poses, id -> (4, 4), of a trajectory that was corrected, as after a closed loop.
+        ``covariances``, id -> (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
+
+        1. Keyframes whose view moves by more than half a voxel are withdrawn: what they said of wrong places
+           no longer counts.
+        2. All are moved and swept at their new poses one by one, each time the one whose viewpoint is
+           furthest from those of all keyframes in their places, so that few of them soon cover the map.
+        3. Those whose evidence has changed are swept again, as by :meth:`renew`, whose ``tolerance`` this is.
+
+        A keyframe stays where it is if nothing in its view would move by more than ``least`` voxels, unless
+        it is given another covariance; the pose at which it was placed still counts.
+
+        After ``seconds`` no further keyframe is begun, but one is moved in any case: give ``left`` of the
+        result to the next call. Until then those of ``left`` that were withdrawn have no evidence in the map,
+        unless :meth:`infer`, or :meth:`renew` with their ids, sweeps them at their old poses.
+        Afterwards :meth:`infer` makes, with ``least`` 0, the map that is made anew with these poses, bit for
+        bit, also if this call was interrupted and the poses are given again. Raises KeyframeError for an
+        unknown id or an impossible pose, before anything moves, and CapacityError if there is not enough
+        memory for a keyframe's new pose; it and those after it are then as if they were ``left``.
+        """
+        return posed.update_poses(self._parts, poses, least, tolerance, seconds, covariances or {})
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
+        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
+        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
+
+        Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
+        share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
+        that of :meth:`infer` does not.
+        """
+        return posed.renew(self._parts, keyframes, tolerance, seconds, progress)
+
+    def refine_pose(
+        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+    ) -> "posed.RefinedPose":
+        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
+        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
+        return posed.refine_pose(self._parts, id, config, guesses)
+
+    def depth_log_likelihood(self, id: int) -> float:
+        """Mean log-likelihood, per metre, of a keyframe's depth in the map of all others; NaN if it has
+        none. Raises KeyframeError."""
+        return posed.depth_log_likelihood(self._parts, id)
+
+    @cached_property
+    def aligner(self) -> "posed.Aligner":
+        """Aligns the keyframes with the surface that they have measured."""
+        return posed.aligner_of(self._parts)
 
     def freeze_keyframe(self, id: int) -> None:
         """Add a keyframe's messages to the evidence that inference starts from, and drop its image.
@@ -182,19 +259,20 @@ class MRFMap(PosedMRF):
         A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. Of bricks that
         are not allocated yet, only that it saw them to be free is kept.
         """
-        keyframe = self._find(id)
-        self._restore_messages()
+        parts, keyframe = self._parts, self._parts.find(id)
+        inferring.restore_messages(parts)
         if keyframe.messages is None:
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
-        self._keep_share(keyframe)
-        self._allocator.freeze(keyframe)
-        self.aligner.surface.freeze(keyframe)
-        self._decisions.frozen(id)
-        self._frozen[id] = keyframe.name
+        parts.colors.freeze(keyframe)
+        surfacing.keep_rays(parts, keyframe)
+        parts.allocator.freeze(keyframe)
+        parts.surfels.freeze(keyframe)
+        parts.decisions.frozen(id)
+        parts.frozen[id] = keyframe.name
         del self._keyframes[id]
-        self._settled = False
+        parts.settled = False
 
     def infer(
         self,
@@ -222,127 +300,201 @@ class MRFMap(PosedMRF):
     ) -> InferSteps:
         """:meth:`infer` as a generator, which yields an InferProgress after each keyframe. Between two steps
         the map may be queried but not changed."""
-        chosen_ids = check_inference(sweeps, tolerance, keyframes)
-        configured = self.config.inference.sweeps
-        sweeps, tolerance = configured if sweeps is None else sweeps, tolerance or 0.0
-        if chosen_ids is None:
-            chosen = sorted(self._keyframes.values(), key=content_key)
-            self._pool.restart()
-            for keyframe in chosen:
-                # Entry depths of earlier sweeps would change the rounding of rays, so they start over too.
-                keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
-                keyframe.entry_depths_known = False
-                keyframe.messages = None
-                self._allocator.refresh(keyframe)
-            self._messages_lost = False
-        else:
-            chosen = [self._find(id) for id in chosen_ids]
-            self._restore_messages()
-            for keyframe in chosen:
-                self._allocator.refresh(keyframe)
-        for keyframe in chosen:
-            self._pool.touch(keyframe.visible.slots)
-        as_configured = keyframes is None and (sweeps, tolerance) == (configured, 0.0)
-        complete = False
-        try:
-            note = None if self._dated is None or chosen_ids is None else self._dated.note_sweep
-            report = yield from sweep_steps(chosen, self._pool, self._sweeper, sweeps, tolerance, note)
-            complete = report.complete
-        finally:
-            self._settled = complete and as_configured
-            if self._dated is not None and chosen_ids is None:
-                self._dated.outdate()
-        return report
+        return inferring.infer_steps(self._parts, sweeps, tolerance, keyframes)
 
-    def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
+    def checkpoint(self) -> inferring.Checkpoint:
+        """State that :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
+        return inferring.take_checkpoint(self._parts)
+
+    def restore(self, checkpoint: inferring.Checkpoint) -> None:
+        """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
+        inferring.go_back(self._parts, checkpoint)
+
+    def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> "depth_graph.FactorGraph":
         """The factor graph without average messages, for factor_graph.solve: a factor for the ray of every
         ``every``-th pixel in both directions, and one for each voxel's prior; its cells are the pool's
         voxels. Raises CapacityError, which names its size, if there is not enough memory."""
         keyframes = sorted(self._keyframes.values(), key=content_key)
         for keyframe in keyframes:
-            self._allocator.refresh(keyframe)
+            self._parts.allocator.refresh(keyframe)
         parts = (self.sensor, self.config.inference, self.config.volume)
-        return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
+        return depth_graph.depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
 
     def adopt(self, log_odds: NDArray[np.float32]) -> None:
         """Use these log-odds, (cells,) of :meth:`factor_graph`, as beliefs until the next infer."""
-        self._pool.restart()
-        for keyframe in self._keyframes.values():
-            keyframe.messages = None
-        self._allocator.mark_without_messages(self._keyframes.values())
-        self._show(self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
-        self._messages_lost, self._settled = bool(self._keyframes), False
+        inferring.adopt(self._parts, log_odds)
 
-    def checkpoint(self) -> Checkpoint:
-        """State that :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
-        return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost, self._settled)
+    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
+        """The bricks that a keyframe's rays cross, (n, 3), whether they are allocated or not."""
+        footprint = self._parts.find(id).footprint
+        return footprint.window.bricks_of(footprint.crossed)
 
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
-        go_back(checkpoint, self._pool, self._keyframes.values())
-        self._messages_lost, self._settled = checkpoint.messages_lost, checkpoint.settled
-        self._allocator.mark_without_messages(self._keyframes.values())
-        if self._dated is not None:
-            self._dated.outdate()
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
+        frozen ones count as one; 255 means 255 or more."""
+        sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
+        return count_observations(slots, sent, self._pool)
+
+    @property
+    def last_voxel_steps(self) -> int:
+        """Voxels that the rays of the last swept keyframe crossed, summed over its rays."""
+        return self._parts.sweeper.voxel_steps
+
+    def statistics(self) -> MapStatistics:
+        """The size of the map."""
+        return self._parts.statistics()
+
+    @property
+    def has_colors(self) -> bool:
+        """True if any voxel may have a colour: a keyframe has been added with a colour image."""
+        return bool(self._parts.colors)
+
+    @tensors.in_kind("points")
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours that cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue,
+        and how much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its
+        ray by the probability that they are what it saw, as of the last :meth:`infer`."""
+        return self._current_colors().at(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
+        return self._current_colors().within(slots)
+
+    def recent_colors(self) -> NDArray[np.uint8]:
+        """Colours (slots * 512, 4) while keyframes come, at the price of the new ones: those of others are
+        as they were found before (MapColors.follow)."""
+        inferring.restore_messages(self._parts)
+        return self._parts.colors.follow()
+
+    def _current_colors(self) -> MapColors:
+        if not self._parts.colors.is_current:
+            inferring.restore_messages(self._parts)
+        return self._parts.colors
+
+    @property
+    def keeps_surface(self) -> bool:
+        """True if frozen keyframes leave what they measured of the surface."""
+        return self._parts.kept.wanted
+
+    @property
+    def has_surface(self) -> bool:
+        """True if there is a surface of all keyframes that the map was made of: none is frozen, or what
+        frozen ones measured is kept (``keep_surface``)."""
+        return self._parts.has_surface
+
+    def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`: found once for each
+        state of the map, and not to be written to. ``between`` is called after each keyframe. Raises
+        CapacityError if there is not enough memory."""
+        return surfacing.surface_field(self._parts, between)
+
+    def surface(self, between: Callable[[], object] = lambda: None) -> "surfacing.FusedSurface":
+        """The surface that the keyframes measured, by marching cubes through the mean of their signed
+        distances: vertices, triangles, normals, and for each vertex a standard deviation in metres, and its
+        colour if keyframes have colour images.
+
+        It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
+        Frozen keyframes have no images: their part is kept with ``keep_surface``, else they have none.
+        ``between`` is called many times in a second; what it raises ends the work. Raises ConfigError for a
+        map without keyframes, CapacityError if there is not enough memory.
+        """
+        return surfacing.map_surface(self, self._parts, between)
+
+    def _measured_surface(self) -> "MeasuredDepth | None":
+        return surfacing.rendered(self, self._parts) if self.has_surface else None
+
+    @property
+    def now_s(self) -> float:
+        """The time that the map is for, in seconds: the newest keyframe's stamp; NaN without keyframes."""
+        return self._parts.now_s
+
+    def at(self, stamp_s: float) -> "reading.MapReading":
+        """The map as it was believed at a time in seconds, from the keyframes up to then.
+
+        Frozen keyframes count from the newest of them on. Messages are those of now: they follow from all
+        keyframes, also from later ones. Raises ConfigError in a map of a static world
+        (``time.half_life_s`` is 0), where keyframes have no order.
+        """
+        return self.layer("both", stamp_s)
+
+    @property
+    def static(self) -> "reading.MapReading":
+        """The static layer: the map without what came after its surroundings were mapped. Raises ConfigError
+        in a map of a static world."""
+        return self.layer("static")
+
+    @property
+    def dynamic(self) -> "reading.MapReading":
+        """The dynamic layer: what is occupied now, although all keyframes together say free and show no
+        surface near. All else is unknown. Raises ConfigError in a map of a static world."""
+        return self.layer("dynamic")
+
+    def layer(self, which: "reading.Layer" = "both", stamp_s: float | None = None) -> "reading.MapReading":
+        """One layer of the map, "static" or "dynamic", or "both", which is the whole map, to be queried and
+        exported; as it was believed at ``stamp_s`` in seconds, now if None.
+
+        Raises ConfigError for another name, and in a map of a static world, which has "both" only and no
+        other time than now.
+        """
+        return reading.layer(self, self._parts, which, stamp_s)
+
+    @property
+    def decided(self) -> "reading.MapReading":
+        """The map by what is occupied, to be queried, cast rays in, drawn and exported: :meth:`state` answers
+        by it.
+
+        Besides the voxels whose marginal is over one half it has those that win the vote of the rays: each
+        measured ray votes for the voxel that most likely is its first surface, and against those in front of
+        it (inference.surface_votes). A wall that is seen with a sigma of several voxels has no voxel that is
+        more likely occupied than not. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the
+        states allow, once the map is settled and has a surface; else those of winners are raised to just
+        above even odds, and all others are the marginals'. Votes of frozen keyframes are kept with
+        ``keep_surface``, else they have none.
+        """
+        return self.decide()
+
+    def decide(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
+        """:attr:`decided`; ``between`` is called after each keyframe whose votes or distances are found, and
+        what it raises ends the work. Raises CapacityError if there is not enough memory."""
+        return reading.decide(self, self._parts, between)
+
+    def calibrated(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
+        """The map by the probability that each voxel holds a surface, from the distances of all rays
+        (methods.mrf.calibrated), which can be trusted as a probability; the marginals are more cautious.
+        Found once for each state of the map. ``between`` is called after each keyframe. Raises CapacityError
+        if there is not enough memory."""
+        return reading.calibrated(self, self._parts, between)
+
+    def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
+        """Calibrated where distances are at hand, else the marginals."""
+        return self.calibrated()._grid() if self.has_surface else self._grid()
+
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
+        return self._parts.decisions.winners(self.settled)
+
+    def changes(self, since_s: float) -> "change.MapChange":
+        """Difference between the map as it was believed at a time in seconds and as it is now: its
+        ``appeared`` and ``vanished`` are voxels that were free and are occupied, and the reverse; ``points``,
+        ``before`` and ``after`` list all voxels whose state has changed, also those that were seen first
+        since then. Raises ConfigError in a map of a static world."""
+        return change.compare_maps(self.at(since_s), self)
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
-        keyframes = list(self._keyframes.values())
-        stored = [StoredKeyframe.of(keyframe) for keyframe in keyframes]
-        header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
-        parked = () if self.window is None else self.window.save_beside(Path(path), self)
-        parts = (self._frozen, parked, self._dated, self._colors, self._kept)
-        write_contents(Path(path), contents_of(header, self._registry, keyframes, *parts))
-        if self.window is not None:
-            self.window.saved(Path(path))
+        storage.save(self, self._parts, self._next_id, Path(path), self.window)
 
     @classmethod
     def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
         """Read a saved map, which can be queried at once and extended. ``memory_limit_gb`` overrides the
         saved limit. Raises MapFileError, or CapacityError if there is not enough memory."""
-        contents = read_contents(Path(path))
-        header, bricks = contents.header, contents.bricks
-        with naming(Path(path)):
+        contents = storage.read_contents(Path(path))
+        header = contents.header
+        with map_file.naming(Path(path)):
             m = cls.with_noise(header.limited_to(memory_limit_gb), header.noise)
-            if len(bricks):
-                slots = m._registry.restore(bricks, contents.frozen_owners)
-            m._registry.see_for_good(contents.frozen_crossed)
-            m._restore_shares(contents.frozen_colors, contents.kept)
-            m._frozen = dict(contents.frozen)
-            for k in header.keyframes:
-                image = m._upload(k.depth_m, k.camera, k.color, **k.own.arguments())
-                parts = (image, k.T_world_camera, k.stamp_s)
-                m._keyframes[k.id] = m._allocator.place(k.id, k.name, *parts)
+            slots = storage.place_contents(contents, m._parts)
             if m.window is not None:
                 m.window.resume(Path(path), contents.parked)
-        if len(bricks):
-            if contents.evidence is not None:
-                m._pool.write("evidence", slots, contents.evidence)
-            if m._dated is not None and contents.frozen_dated is not None:
-                m._dated.restore_frozen(slots, *contents.frozen_dated)
-            m._show(slots, contents.belief)
-            if m._dated is not None and contents.total is not None:
-                m._pool.write("total", slots, contents.total)
-            m._colors.show(slots, contents.colors)
+        storage.show_contents(contents, m._parts, slots)
         m._next_id, m._up = header.next_id, header.up
-        m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
-
-    def _upload(
-        self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
-        noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
-        pose_covariance: ArrayLike | None,
-    ) -> DepthImage:  # fmt: skip
-        depth = checked_depth(depth_m, camera, self.sensor.min_depth)
-        depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
-        if self.sensor.no_return != "ignore":
-            own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
-        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)
-        if not self._keyframes:
-            warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
-        return image
-
-    def _restore_messages(self) -> None:
-        """Compute the messages of a loaded map: its file holds none, because they follow from the images."""
-        if self._messages_lost:
-            self.infer()

@@ -2,22 +2,30 @@
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
-from taichi_mrf.geometry.up import Up
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.surfacing import WithSurface, measured_depth_of, surface_field_of
-from taichi_mrf.methods.protocol import MappedKeyframe
-from taichi_mrf.queries.colored import blended_colors
+from taichi_mrf.methods.mrf.inferring import restore_messages
+from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.methods.mrf.surfacing import (
+    map_surface,
+    measured_depth_of,
+    rendered,
+    surface,
+    surface_field,
+    surface_field_of,
+)
+from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.view import View
 from taichi_mrf.system import tensors
@@ -45,30 +53,27 @@ class MapReading(BrickMap):
     It is good for as long as no keyframe of the map is added, removed, moved or frozen.
     """
 
-    def __init__(self, source: WithSurface, belief: "ti.Ndarray", rays: RaysThen | None = None) -> None:
-        """``belief`` (capacity * 512) are log-odds of the voxels of the source's pool; without ``rays``,
-        surface and colours are those of the source."""
+    def __init__(
+        self, source: OccupancyMap, parts: MapParts, belief: "ti.Ndarray", rays: RaysThen | None = None
+    ) -> None:
+        """``belief`` (capacity * 512) are log-odds of the voxels of the source's pool, ``parts`` are the
+        source's; without ``rays``, surface and colours are those of the source."""
         self.METHOD: Method = source.METHOD  # type: ignore[misc]
         self.config, self.sensor, self.noise = source.config, source.sensor, source.noise
         self.voxel_size = source.voxel_size
-        self._source, self._version, self._rays = source, source._registry.version, rays
-        self._registry, self._up = source._registry, source._up
+        self._source, self._parts, self._rays = source, parts, rays
+        self._registry, self._version, self._up = parts.registry, parts.registry.version, source.up
         self.seen_free_log_odds = source.seen_free_log_odds
-        self._pool = copy.copy(source._pool)
+        self._pool = copy.copy(parts.pool)
         self._pool.dated, self._pool.total = None, belief
-        self._pool.bricks, self._pool.owners = source._pool.bricks.copy(), source._pool.owners.copy()
+        self._pool.bricks, self._pool.owners = parts.pool.bricks.copy(), parts.pool.owners.copy()
         shown = source.view
         self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)
 
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]:
         """The keyframes of the map that is read."""
-        return self._source.keyframes
-
-    @property
-    def up(self) -> Up | None:
-        """The world axis that is up."""
-        return self._source.up
+        return MappingProxyType(self._parts.keyframes)
 
     @property
     def has_colors(self) -> bool:
@@ -90,22 +95,22 @@ class MapReading(BrickMap):
     def has_surface(self) -> bool:
         """True if there is a surface of all keyframes that the reading was made of."""
         if self._rays is None:
-            return self._source.has_surface
-        frozen = self._rays.with_frozen and bool(self._source.frozen)
-        return bool(self._seen or frozen) and (self._source.keeps_surface or not frozen)
+            return self._parts.has_surface
+        frozen = self._rays.with_frozen and bool(self._parts.frozen)
+        return bool(self._seen or frozen) and (self._parts.kept.wanted or not frozen)
 
     def surface_field(self) -> DistanceField:
         """The signed distances that the keyframes of the reading measured. Raises CapacityError."""
         self._check()
         if self._rays is None:
-            return self._source.surface_field()
-        return surface_field_of(self._source, self._judging, self._seen, self._rays.with_frozen)
+            return surface_field(self._parts)
+        return surface_field_of(self._parts, self._judging, self._seen, self._rays.with_frozen)
 
     def _measured_surface(self) -> MeasuredDepth | None:
         """That of the source, or of the keyframes of the reading."""
         self._check()
         if self._rays is None:
-            return self._source._measured_surface()
+            return rendered(self._source, self._parts)
         return self._own_surface if self.has_surface else None
 
     @cached_property
@@ -118,29 +123,29 @@ class MapReading(BrickMap):
         ConfigError if no keyframe was there yet."""
         if self._rays is None:
             self._check()
-            return self._source.surface()
+            return map_surface(self._source, self._parts)
         if not self.has_surface:
             raise ConfigError("there is no keyframe up to this time: there is nothing to make a surface of")
-        found = without_free(self, fused_surface(self.surface_field(), self.voxel_size), self._rays.least)
-        return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
+        return surface(self, self.surface_field(), self._rays.least)
 
     @cached_property
     def _seen(self) -> dict[int, Keyframe]:
         """The keyframes whose rays count."""
         assert self._rays is not None
         until_s = np.inf if self._rays.stamp_s is None else self._rays.stamp_s
-        return {id: k for id, k in self._source.keyframes.items() if k.stamp_s <= until_s}
+        return {id: k for id, k in self._parts.keyframes.items() if k.stamp_s <= until_s}
 
     @cached_property
     def _judging(self) -> BrickPool:
         """The bricks with the log-odds that rays are judged by."""
         assert self._rays is not None
-        return self._source._pool.showing_others(self._rays.belief)
+        return self._parts.pool.showing_others(self._rays.belief)
 
     @cached_property
     def _colors(self) -> MapColors:
-        self._source._prepare_colors()
-        colors = self._source._colors
+        colors = self._parts.colors
+        if not colors.is_current:
+            restore_messages(self._parts)
         if self._rays is None:
             return colors
         return colors.of_some(self._seen, self._judging, self._rays.with_frozen)

@@ -13,37 +13,33 @@ keyframes in the window reach further than the window, hence what is in memory d
 """
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
-from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import (
-    StorableMap,
-    chunk_block,
-    extra_block,
-    first_block,
-    header_of,
-    voxel_block,
-)
-from taichi_mrf.export.chunk_store import Chunk
-from taichi_mrf.export.growing_store import Extras
-from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
-from taichi_mrf.inference.dated import DatedBelief
-from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
-from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.kept_rays import KeptRays
+from taichi_mrf.export.chunk_blocks import StorableMap, header_of
+from taichi_mrf.export.store_header import StoreHeader
+from taichi_mrf.methods.brick_registry import Bricks
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
+from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.methods.mrf.surfacing import measured_bricks, surface_field
 from taichi_mrf.queries.known_bricks import bricks_between
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layers import (
+    COLORS,
+    FIRST,
+    LOG_ODDS,
+    SURFACE,
+    BrickValues,
+    Chunk,
+    known_log_odds,
+)
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, by_chunk, grid_keys
 
 LEAVE = 1.25
@@ -63,59 +59,23 @@ _NONE = np.zeros(0, np.int64)
 class WindowedMap(StorableMap, Protocol):
     """Interface of a map, as its window needs it."""
 
-    @property
-    def keyframes(self) -> Mapping[int, Keyframe]: ...
-
     def infer(self, *, keyframes: Iterable[int] | None) -> object: ...
 
-    @property
-    def settled(self) -> bool: ...
-
     def freeze_keyframe(self, id: int) -> None: ...
-
-    def measured_bricks(self) -> NDArray[np.int32]: ...
-
-    def surface_field(self) -> DistanceField: ...
-
-    def first_surfaces(self) -> NDArray[np.bool_]: ...
 
 
 class MovingWindow:
     """The window of one map, ``size_m`` metres around the newest keyframe's camera."""
 
-    def __init__(
-        self,
-        size_m: float,
-        registry: BrickRegistry,
-        dated: DatedBelief | None,
-        surface: KeyframeSurfels,
-        colors: MapColors,
-        kept: KeptRays,
-    ) -> None:
-        """``dated`` is what follows the messages if evidence has a date, ``surface`` what keyframes are
-        aligned with, ``kept`` what frozen ones measured."""
-        self.size_m, self._dated, self._surface = size_m, dated, surface
-        self._colors, self._kept = colors, kept
+    def __init__(self, size_m: float, parts: MapParts) -> None:
+        """Raises TaichiMRFError without zarr."""
+        library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
+        self.size_m, self._parts = size_m, parts
         self.parked = ParkedChunks()
-        self._registry = registry
+        self._registry = parts.registry
         self._position_m: NDArray[np.float64] | None = None  # where chunks were last looked for
         self._chunks = self.parked.chunks
-        registry.before_claim = self._fetch_crossed
-
-    @staticmethod
-    def of(
-        volume: VolumeConfig,
-        registry: BrickRegistry,
-        dated: DatedBelief | None,
-        surface: KeyframeSurfels,
-        colors: MapColors,
-        kept: KeptRays,
-    ) -> "MovingWindow | None":
-        """The window that a configuration asks for. Raises TaichiMRFError without zarr."""
-        if volume.window_m == 0:
-            return None
-        library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
-        return MovingWindow(volume.window_m, registry, dated, surface, colors, kept)
+        self._registry.before_claim = self._fetch_crossed
 
     @property
     def folder(self) -> Path | None:
@@ -134,13 +94,14 @@ class MovingWindow:
     def follow(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Move the window to a position (3,): freeze the keyframes outside of it, write and release chunks,
         and bring back those that are in it. Disk errors are warnings: the map in memory is whole."""
+        keyframes = self._parts.keyframes
         far = [
             id
-            for id, keyframe in m.keyframes.items()
+            for id, keyframe in keyframes.items()
             if np.linalg.norm(keyframe.T_world_camera[:3, 3] - position_m) > self.size_m
         ]
-        if any(m.keyframes[id].messages is None for id in far):
-            m.infer(keyframes=list(m.keyframes))  # what is frozen cannot be swept again
+        if any(keyframes[id].messages is None for id in far):
+            m.infer(keyframes=list(keyframes))  # what is frozen cannot be swept again
         for id in far:
             m.freeze_keyframe(id)
         moved = self._position_m is None or np.linalg.norm(position_m - self._position_m) > STEP * self.size_m
@@ -153,16 +114,16 @@ class MovingWindow:
         except (MapFileError, CapacityError) as error:
             warnings.warn(f"a chunk near the camera stays on disk: {error}", stacklevel=2)
 
-    def save_beside(self, path: Path, m: WindowedMap) -> list[str]:
+    def save_beside(self, path: Path, m: StorableMap) -> list[str]:
         """Make the folder beside a map's file hold the whole map; returns the names of the files of the
         chunks that are not in memory. Raises MapFileError."""
-        header = header_of(m)
-        surface = None
-        if self._kept.wanted:
-            self._fetch_crossed(m.measured_bricks())
-            surface = m.surface_field() if m.settled else self._kept.share.field
-        first = m.first_surfaces() if self._kept.wanted and m.settled else None
-        resident = self._resident(m, header, surface, first)
+        header, parts = header_of(m), self._parts
+        surface = first = None
+        if parts.kept.wanted:
+            self._fetch_crossed(measured_bricks(parts))
+            surface = surface_field(parts) if parts.settled else parts.kept.share.field
+            first = parts.decisions.winners(settled=True) if parts.settled else None
+        resident = self._resident(header, surface, first)
         self.parked.complete(folder_beside(path), resident, header)
         return self.parked.names
 
@@ -198,12 +159,12 @@ class MovingWindow:
             slots = registry.restore(found.bricks, found.owners)
             registry.pool.write("total", slots, found.total)
             registry.pool.write("evidence", slots, found.evidence)
-            if self._dated is not None and found.dated is not None:
-                self._dated.restore_frozen(slots, *found.dated)
+            if self._parts.dated is not None and found.dated is not None:
+                self._parts.dated.restore_frozen(slots, *found.dated)
         registry.see_for_good(found.crossed)
-        self._surface.restore(found.surfels)
-        self._colors.restore(found.colors)
-        self._kept.restore(found.rays)
+        self._parts.surfels.restore(found.surfels)
+        self._parts.colors.restore(found.colors)
+        self._parts.kept.restore(found.rays)
 
     def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
@@ -224,35 +185,28 @@ class MovingWindow:
         """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""
         slots = self._slots_in(chunks)
         contents = self._contents(chunks, slots)
-        extras: dict[str, dict[Chunk, NDArray]] = {}
-        if self._colors:
-            extras[COLORS] = {
-                chunk: voxel_block(chunk, found.colors.bricks, found.colors.numbers, found.colors.colors())
-                for chunk, found in contents.items()
-            }
-        if self._kept.wanted:
-            extras[SURFACE] = {
-                chunk: _distances(chunk, found.rays.field) for chunk, found in contents.items()
-            }
-            votes = {chunk: found.rays.votes for chunk, found in contents.items()}
-            extras[FIRST] = {c: first_block(c, v.bricks, v.sums[..., 0] > 0) for c, v in votes.items()}
-        self.parked.add(contents, self._voxels(chunks, header), extras, header)
+        layers = {LOG_ODDS: self._voxels(chunks, header)}
+        if self._parts.colors:
+            layers[COLORS] = self._parts.colors.frozen_in(chunks).values
+        if self._parts.kept.wanted:
+            layers |= self._parts.kept.share.in_chunks(chunks).layers
+        self.parked.add(contents, layers, header)
         self._registry.leave(slots, chunks)
-        self._surface.release(chunks)
-        self._colors.release(chunks)
-        self._kept.release(chunks)
+        self._parts.surfels.release(chunks)
+        self._parts.colors.release(chunks)
+        self._parts.kept.release(chunks)
         self._chunks = self.parked.chunks
 
     def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
         """Contents that frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
         pool, frozen_crossed = self._registry.pool, self._registry.frozen_crossed
         pool.keep_evidence()
-        surfels = self._surface.frozen_in(chunks)
+        surfels = self._parts.surfels.frozen_in(chunks)
         slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
         surfels_of = dict(by_chunk(surfels.cells // BRICK))
-        colors = self._colors.frozen_in(chunks)
+        colors = self._parts.colors.frozen_in(chunks)
         colors_of = dict(by_chunk(colors.bricks))
-        rays = self._kept.share.in_chunks(chunks)
+        rays = self._parts.kept.share.in_chunks(chunks)
         contents = {}
         for x, y, z in chunks.tolist():
             inside = slots[slots_of.get((x, y, z), _NONE)]
@@ -262,7 +216,7 @@ class MovingWindow:
                 pool.read("evidence", inside),
                 pool.owners[inside],
                 frozen_crossed[crossed_of.get((x, y, z), _NONE)],
-                None if self._dated is None else self._dated.read_frozen(inside),
+                None if self._parts.dated is None else self._parts.dated.read_frozen(inside),
                 surfels.chosen(surfels_of.get((x, y, z), _NONE)),
                 colors.chosen(colors_of.get((x, y, z), _NONE)),
                 rays.in_chunks(np.array([[x, y, z]], np.int32)),
@@ -270,38 +224,29 @@ class MovingWindow:
         return contents
 
     def _resident(
-        self,
-        m: WindowedMap,
-        header: StoreHeader,
-        surface: DistanceField | None,
-        first: NDArray[np.bool_] | None,
-    ) -> Iterator[tuple[dict[Chunk, NDArray[np.float32]], Extras]]:
-        """The voxels of all chunks in memory, some at a time, with their colours if these are known, with the
-        distances of ``surface``, and with the voxels (slots, 512) that rays take for their ``first`` surface.
-        """
+        self, header: StoreHeader, surface: DistanceField | None, first: NDArray[np.bool_] | None
+    ) -> Iterator[tuple[NDArray[np.int32], dict[str, BrickValues]]]:
+        """All chunks in memory with their layers, some at a time: colours if these are known, the distances
+        of ``surface``, and the voxels (slots, 512) that rays take for their ``first`` surface."""
         measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
-        footprints = [k.footprint for k in m.keyframes.values()]
+        footprints = [k.footprint for k in self._parts.keyframes.values()]
         crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
         chunks = _distinct(np.concatenate([self._chunks_in_memory(), measured, *crossed]))
         for begin in range(0, len(chunks), _AT_ONCE):
             some = chunks[begin : begin + _AT_ONCE]
-            extras: dict[str, dict[Chunk, NDArray]] = {}
             slots = self._slots_in(some)
-            colors, bricks = self._colors.stored(slots, m.settled), self._registry.pool.bricks[slots]
-            rows_of = dict(by_chunk(bricks))
+            bricks, layers = self._registry.pool.bricks[slots], {}
+            colors = self._parts.colors.stored(slots, self._parts.settled)
             if len(colors):
-                extras[COLORS] = {
-                    c: extra_block(c, bricks[rows], colors[rows]) for c, rows in rows_of.items()
-                }
+                layers[COLORS] = BrickValues(bricks, colors)
             if first is not None:
-                here = first[slots]
-                extras[FIRST] = {c: first_block(c, bricks[rows], here[rows]) for c, rows in rows_of.items()}
+                layers[FIRST] = BrickValues(bricks, first[slots].astype(np.uint8))
             if surface is not None:
-                extras[SURFACE] = {(x, y, z): _distances((x, y, z), surface) for x, y, z in some.tolist()}
-            yield self._voxels(some, header), extras
+                layers[SURFACE] = surface.values.in_chunks(some)
+            yield some, {LOG_ODDS: self._voxels(some, header), **layers}
 
-    def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> dict[Chunk, NDArray[np.float32]]:
-        """(64, 64, 64) log-odds of some chunks (n, 3), NaN for unknown."""
+    def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> BrickValues:
+        """Log-odds of the bricks in some chunks (n, 3)."""
         topology, pool = self._registry.topology, self._registry.pool
         all_bricks = _bricks_of(chunks)
         slots = topology.slots(all_bricks)
@@ -309,12 +254,7 @@ class MovingWindow:
         bricks = np.concatenate([all_bricks[has_voxels], all_bricks[is_free]])
         empty = np.full((int(is_free.sum()), VOXELS), header.seen_free_log_odds, np.float32)
         log_odds = np.concatenate([pool.read("belief", slots[has_voxels]), empty])
-        rows_of = dict(by_chunk(bricks))
-        blocks = {}
-        for x, y, z in chunks.tolist():
-            rows = rows_of.get((x, y, z), _NONE)
-            blocks[x, y, z] = chunk_block((x, y, z), bricks[rows], log_odds[rows], header.prior_log_odds)
-        return blocks
+        return BrickValues(bricks, known_log_odds(log_odds, header.prior_log_odds))
 
     def _slots_in(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
         """The slots of the bricks in some chunks (n, 3), by their coordinates."""
@@ -325,7 +265,7 @@ class MovingWindow:
     def _chunks_in_memory(self) -> NDArray[np.int32]:
         """The chunks (n, 3) with voxels, or that frozen keyframes' rays cross or have measured."""
         pool, registry = self._registry.pool, self._registry
-        measured = self._kept.share.distances.bricks
+        measured = self._parts.kept.share.distances.bricks
         return _distinct(
             np.concatenate([pool.bricks[pool.in_use], registry.frozen_crossed, measured]) // CHUNK
         )
@@ -344,11 +284,6 @@ class MovingWindow:
         beside = np.maximum(np.maximum(lower - position_m, position_m - (lower + side_m)), 0.0)
         distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
         return distances
-
-
-def _distances(chunk: Chunk, surface: DistanceField) -> NDArray[np.float32]:
-    """(64, 64, 64, 2) weights and distances of a chunk."""
-    return np.stack(surface.box(np.array(chunk, np.int64) * CHUNK_VOXELS, CHUNK_VOXELS), axis=-1)
 
 
 def _distinct(chunks: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.methods.map_file import read_places
-from taichi_mrf.methods.mrf.kept_rays import RayShare
-from taichi_mrf.methods.mrf.storage import (
+from taichi_mrf.methods.mrf.frozen_arrays import (
     color_arrays,
     dated_arrays,
     ray_arrays,
@@ -27,9 +25,11 @@ from taichi_mrf.methods.mrf.storage import (
     read_dated,
     read_rays,
 )
+from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.files import exists
 from taichi_mrf.system.npz_file import open_npz
+from taichi_mrf.voxels.layers import Chunk
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, VOXELS
 
 _NAME = re.compile(r"(-?\d{1,7})_(-?\d{1,7})_(-?\d{1,7})-[0-9a-f]{16}\.npz")

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_store import SUFFIX, Chunk, ChunkStore, new_store
-from taichi_mrf.export.growing_store import Extras, put_chunks
+from taichi_mrf.export.chunk_store import SUFFIX, ChunkStore, new_store
+from taichi_mrf.export.growing_store import put_chunks
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk, chunk_of, read_parked
 from taichi_mrf.system.files import is_file
+from taichi_mrf.voxels.layers import Chunk, Layers
 
 PARKED = "parked"
 
@@ -63,20 +64,14 @@ class ParkedChunks:
                 self._copy(folder)
             self.folder = folder
 
-    def add(
-        self,
-        chunks: Mapping[Chunk, ParkedChunk],
-        blocks: Mapping[Chunk, NDArray[np.float32]],
-        extras: Extras,
-        header: StoreHeader,
-    ) -> None:
-        """Write chunks that are about to leave memory, and their voxels, (64, 64, 64) log-odds each, and
-        ``extras`` of these. Raises MapFileError; none of them counts as written then."""
+    def add(self, chunks: Mapping[Chunk, ParkedChunk], layers: Layers, header: StoreHeader) -> None:
+        """Write chunks that are about to leave memory, and the layers of their voxels. Raises MapFileError;
+        none of them counts as written then."""
         folder = self._begun(header)
         names = {chunk: parked.file_name(chunk) for chunk, parked in chunks.items()}
         for chunk, parked in chunks.items():
             parked.write(folder / PARKED / names[chunk])
-        put_chunks(folder, header, blocks, extras)
+        put_chunks(folder, header, np.array(list(chunks), np.int32), layers)
         self._names |= names
 
     def read(self, chunk: Chunk, voxel_size: float) -> ParkedChunk:
@@ -104,17 +99,17 @@ class ParkedChunks:
     def complete(
         self,
         folder: Path,
-        resident: Iterable[tuple[Mapping[Chunk, NDArray[np.float32]], Extras]],
+        resident: Iterable[tuple[NDArray[np.int32], Layers]],
         header: StoreHeader,
     ) -> None:
-        """Make a folder hold the whole map: all files, and the voxels of the ``resident`` chunks too, (64,
-        64, 64) log-odds each, with their extras. Raises MapFileError."""
+        """Make a folder hold the whole map: all files, and the layers of the ``resident`` chunks too. Raises
+        MapFileError."""
         self.folder = self.folder or folder
         self._begun(header)
         if folder != self.folder:
             self._copy(folder)
-        for blocks, extras in resident:
-            put_chunks(folder, header, blocks, extras)
+        for chunks, layers in resident:
+            put_chunks(folder, header, chunks, layers)
 
     def tidy(self, folder: Path) -> None:
         """A map that names exactly these chunks was saved beside a folder: remove all other files."""

@@ -16,21 +16,17 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.geometry.spread import furthest_first
-from taichi_mrf.inference.incremental import IncrementalInference
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.brick_map import check_inference
-from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
-from taichi_mrf.methods.mrf.reading import ReadableMRF
+from taichi_mrf.methods.mrf.inferring import restore_messages
+from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.sensor.pose_doubt import Covariance, checked_covariance
 from taichi_mrf.system.interrupts import interrupts_wait
 from taichi_mrf.voxels.layout import BRICK
 
 EXACT = np.zeros((6, 6))
 """The covariance of a pose that is taken as exact."""
-
-LEAST_MOTION = 0.1
-"""Motion of what a keyframe sees, in voxels, up to which a new pose is left out."""
 
 WRONG_MOTION = 0.5
 """Motion of what a keyframe sees, in voxels, above which its messages are no longer right."""
@@ -42,7 +38,7 @@ different directions from the same place are far apart."""
 
 @dataclass(frozen=True)
 class PoseUpdate:
-    """Result of :meth:`PosedMRF.update_poses`: the keyframes that it ``moved``, those that it ``kept`` where
+    """Result of MRFMap.update_poses: the keyframes that it ``moved``, those that it ``kept`` where
     they were because their pose has hardly changed, and the new poses (4, 4) for which time was over, which
     are ``left`` for the next call. ``report`` is that of the sweeps after all motions, or, if some are left,
     of those sweeps that were made."""
@@ -58,164 +54,136 @@ class PoseUpdate:
         return not self.left and self.report.complete
 
 
-class PosedMRF(ReadableMRF):
-    """The part of an MRFMap that changes poses, and renews what follows from them."""
+def move_keyframe(
+    parts: MapParts, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
+) -> None:
+    """MRFMap.move_keyframe."""
+    keyframe = parts.find(id)
+    T, image = as_pose(T_world_camera), keyframe.image
+    if pose_covariance is not None:
+        image = image.doubting(checked_covariance(pose_covariance))
+    restore_messages(parts)
+    parts.settled = False
+    with interrupts_wait():
+        parts.allocator.take_out(keyframe)
+        try:
+            parts.keyframes[id] = parts.allocator.place_again(keyframe, image, T)
+        except Exception:
+            parts.keyframes[id] = parts.allocator.put_back(keyframe)
+            raise
 
-    aligner: Aligner
-    _allocator: KeyframeAllocator
-    _incremental: IncrementalInference
-    _settled: bool
 
-    def move_keyframe(
-        self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
-    ) -> None:
-        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped.
+def update_poses(
+    parts: MapParts,
+    poses: Mapping[int, ArrayLike],
+    least: float,
+    tolerance: float | None,
+    seconds: float | None,
+    covariances: Mapping[int, ArrayLike],
+) -> PoseUpdate:
+    """MRFMap.update_poses."""
+    begin = time.perf_counter()
+    voxel_size, keyframes = parts.config.voxel_size, parts.keyframes
+    least_m = real(least, "least", least=0) * voxel_size
+    if seconds is not None:
+        real(seconds, "seconds", least=0)
+    wanted = {parts.find(id).id: _pose_of(id, T) for id, T in poses.items()}
+    doubts = {id: _covariance_of(id, covariances[id]) for id in wanted if id in covariances}
+    motions_m = {id: _largest_motion_m(keyframes[id], T) for id, T in wanted.items()}
+    kept = tuple(
+        id for id in wanted if motions_m[id] <= least_m and _has_covariance(keyframes[id], doubts.get(id))
+    )
+    moving = sorted(wanted.keys() - set(kept), key=lambda id: (-motions_m[id], id))
 
-        ``pose_covariance`` (6, 6) is that of the new pose, as in :meth:`add_keyframe`, zeros if it is exact.
-        Without it the keyframe keeps the covariance that it has. Raises KeyframeError, or CapacityError if
-        there is not enough memory; the map is then unchanged.
-        """
-        keyframe = self._find(id)
-        T, image = as_pose(T_world_camera), keyframe.image
-        if pose_covariance is not None:
-            image = image.doubting(checked_covariance(pose_covariance))
-        self._restore_messages()
-        self._settled = False
+    def time_left() -> float | None:
+        return None if seconds is None else max(0.0, seconds - (time.perf_counter() - begin))
+
+    # 1. What was said of wrong places goes first.
+    wrong = [id for id in moving if motions_m[id] > WRONG_MOTION * voxel_size]
+    restore_messages(parts)
+    if moving:
+        parts.settled = False
+    for id in wrong:
         with interrupts_wait():
-            self._allocator.take_out(keyframe)
-            try:
-                self._keyframes[id] = self._allocator.place_again(keyframe, image, T)
-            except Exception:
-                self._keyframes[id] = self._allocator.put_back(keyframe)
-                raise
+            parts.allocator.withdraw(keyframes[id])
+            keyframes[id].withdrawn = True
+    # 2. Evidence comes back where there is least of it.
+    left = {id: wanted[id] for id in moving}
+    others = [keyframe for id, keyframe in keyframes.items() if id not in left]
+    there = [_viewpoint(each.T_world_camera) for each in others if each.messages is not None]
+    moved: list[int] = []
+    for place in furthest_first([_viewpoint(wanted[id]) for id in moving], there):
+        id = moving[place]
+        if moved and time_left() == 0.0:
+            break
+        move_keyframe(parts, id, left.pop(id), doubts.get(id))
+        parts.incremental.sweep(keyframes[id])
+        moved.append(id)
+    # 3. The others follow.
+    if left:
+        rays = sum(keyframes[id].rays for id in moved)
+        report = InferReport(time.perf_counter() - begin, 1.0, len(moved), rays, complete=False)
+    else:
+        back = [id for id in kept if keyframes[id].withdrawn]  # an earlier call had another pose
+        report = renew(parts, back, tolerance, time_left())
+    return PoseUpdate(tuple(moved), kept, left, report)
 
-    def update_poses(
-        self,
-        poses: Mapping[int, ArrayLike],
-        least: float = LEAST_MOTION,
-        tolerance: float | None = None,
-        seconds: float | None = None,
-        covariances: Mapping[int, ArrayLike] | None = None,
-    ) -> PoseUpdate:
-        """Take in the poses, id -> (4, 4), of a trajectory that was corrected, as after a closed loop.
-        ``covariances``, id -> (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
 
-        1. Keyframes whose view moves by more than half a voxel are withdrawn: what they said of wrong places
-           no longer counts.
-        2. All are moved and swept at their new poses one by one, each time the one whose viewpoint is
-           furthest from those of all keyframes in their places, so that few of them soon cover the map.
-        3. Those whose evidence has changed are swept again, as by :meth:`renew`, whose ``tolerance`` this is.
+def renew(
+    parts: MapParts,
+    keyframes: Iterable[int] = (),
+    tolerance: float | None = None,
+    seconds: float | None = None,
+    progress: Progress | None = None,
+) -> InferReport:
+    """MRFMap.renew."""
+    first = [parts.find(id).id for id in check_inference(None, tolerance, keyframes) or ()]
+    if seconds is not None:
+        real(seconds, "seconds", least=0)
+    restore_messages(parts)
+    if tolerance is None:
+        tolerance = parts.config.inference.renew_tolerance
+    parts.settled = False
+    return parts.incremental.run(parts.keyframes, first, tolerance, seconds, progress)
 
-        A keyframe stays where it is if nothing in its view would move by more than ``least`` voxels, unless
-        it is given another covariance; the pose at which it was placed still counts.
 
-        After ``seconds`` no further keyframe is begun, but one is moved in any case: give ``left`` of the
-        result to the next call. Until then those of ``left`` that were withdrawn have no evidence in the map,
-        unless :meth:`infer`, or :meth:`renew` with their ids, sweeps them at their old poses.
-        Afterwards :meth:`infer` makes, with ``least`` 0, the map that is made anew with these poses, bit for
-        bit, also if this call was interrupted and the poses are given again. Raises KeyframeError for an
-        unknown id or an impossible pose, before anything moves, and CapacityError if there is not enough
-        memory for a keyframe's new pose; it and those after it are then as if they were ``left``.
-        """
-        begin = time.perf_counter()
-        least_m = real(least, "least", least=0) * self.voxel_size
-        if seconds is not None:
-            real(seconds, "seconds", least=0)
-        wanted = {self._find(id).id: _pose_of(id, T) for id, T in poses.items()}
-        stated = {} if covariances is None else covariances
-        doubts = {id: _covariance_of(id, stated[id]) for id in wanted if id in stated}
-        motions_m = {id: _largest_motion_m(self._keyframes[id], T) for id, T in wanted.items()}
-        kept = tuple(
-            id for id in wanted if motions_m[id] <= least_m and self._has_covariance(id, doubts.get(id))
-        )
-        moving = sorted(wanted.keys() - set(kept), key=lambda id: (-motions_m[id], id))
+def aligner_of(parts: MapParts) -> Aligner:
+    """The aligner of a map's keyframes."""
+    return Aligner(parts.view, parts.surfels)
 
-        def time_left() -> float | None:
-            return None if seconds is None else max(0.0, seconds - (time.perf_counter() - begin))
 
-        # 1. What was said of wrong places goes first.
-        wrong = [id for id in moving if motions_m[id] > WRONG_MOTION * self.voxel_size]
-        self._restore_messages()
-        if moving:
-            self._settled = False
-        for id in wrong:
-            with interrupts_wait():
-                self._allocator.withdraw(self._keyframes[id])
-                self._keyframes[id].withdrawn = True
-        # 2. Evidence comes back where there is least of it.
-        left = {id: wanted[id] for id in moving}
-        others = [keyframe for id, keyframe in self._keyframes.items() if id not in left]
-        there = [_viewpoint(each.T_world_camera) for each in others if each.messages is not None]
-        moved: list[int] = []
-        for place in furthest_first([_viewpoint(wanted[id]) for id in moving], there):
-            id = moving[place]
-            if moved and time_left() == 0.0:
-                break
-            self.move_keyframe(id, left.pop(id), doubts.get(id))
-            self._incremental.sweep(self._keyframes[id])
-            moved.append(id)
-        # 3. The others follow.
-        if left:
-            rays = sum(self._keyframes[id].rays for id in moved)
-            report = InferReport(time.perf_counter() - begin, 1.0, len(moved), rays, complete=False)
-        else:
-            back = [id for id in kept if self._keyframes[id].withdrawn]  # an earlier call had another pose
-            report = self.renew(back, tolerance, time_left())
-        return PoseUpdate(tuple(moved), kept, left, report)
+def refine_pose(
+    parts: MapParts, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+) -> RefinedPose:
+    """MRFMap.refine_pose."""
+    keyframe = _with_messages(parts, id)
+    poses = [as_pose(T) for T in guesses]
+    refined = aligner_of(parts).refine(keyframe, parts.keyframes, config or PoseConfig(), poses)
+    if refined.accepted:
+        move_keyframe(parts, id, refined.T_world_camera)
+    return refined
 
-    def _has_covariance(self, id: int, pose_covariance: Covariance | None) -> bool:
-        """True if a keyframe's covariance is this one already, or if this one is None."""
-        own = self._keyframes[id].own.pose_covariance
-        return pose_covariance is None or np.array_equal(EXACT if own is None else own, pose_covariance)
 
-    def renew(
-        self,
-        keyframes: Iterable[int] = (),
-        tolerance: float | None = None,
-        seconds: float | None = None,
-        progress: Progress | None = None,
-    ) -> InferReport:
-        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
-        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
-        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
+def depth_log_likelihood(parts: MapParts, id: int) -> float:
+    """MRFMap.depth_log_likelihood."""
+    keyframe, view = _with_messages(parts, id), parts.view
+    with map_of_others(view, keyframe):
+        return log_likelihood(view, keyframe, keyframe.T_world_camera, parts.config.sensor.max_depth)
 
-        Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
-        share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
-        that of :meth:`infer` does not.
-        """
-        first = [self._find(id).id for id in check_inference(None, tolerance, keyframes) or ()]
-        if seconds is not None:
-            real(seconds, "seconds", least=0)
-        self._restore_messages()
-        if tolerance is None:
-            tolerance = self.config.inference.renew_tolerance
-        self._settled = False
-        return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
-    def refine_pose(
-        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
-    ) -> RefinedPose:
-        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
-        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
-        keyframe = self._find(id)
-        self._restore_messages()
-        if keyframe.messages is not None:
-            self._allocator.refresh(keyframe)
-        poses = [as_pose(T) for T in guesses]
-        refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
-        if refined.accepted:
-            self.move_keyframe(id, refined.T_world_camera)
-        return refined
+def _with_messages(parts: MapParts, id: int) -> Keyframe:
+    """A keyframe whose messages, if it has any, are those of its visible bricks."""
+    keyframe = parts.find(id)
+    restore_messages(parts)
+    if keyframe.messages is not None:
+        parts.allocator.refresh(keyframe)
+    return keyframe
 
-    def depth_log_likelihood(self, id: int) -> float:
-        """Mean log-likelihood, per metre, of a keyframe's depth in the map of all others; NaN if it has
-        none. Raises KeyframeError."""
-        keyframe = self._find(id)
-        self._restore_messages()
-        if keyframe.messages is not None:
-            self._allocator.refresh(keyframe)
-        with map_of_others(self.view, keyframe):
-            return log_likelihood(self.view, keyframe, keyframe.T_world_camera, self.sensor.max_depth)
+
+def _has_covariance(keyframe: Keyframe, pose_covariance: Covariance | None) -> bool:
+    """True if a keyframe's covariance is this one already, or if this one is None."""
+    own = keyframe.own.pose_covariance
+    return pose_covariance is None or np.array_equal(EXACT if own is None else own, pose_covariance)
 
 
 def _pose_of(id: int, T_world_camera: ArrayLike) -> Pose:

@@ -6,7 +6,6 @@ the beliefs so that a loaded map answers queries at once, and with dates also wh
 from which what moves follows.
 """
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,25 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
 from taichi_mrf.inference.color_sums import ColorShare
-from taichi_mrf.inference.dated import DatedBelief
-from taichi_mrf.inference.dated_channels import NEVER
-from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.methods.brick_registry import BrickRegistry
-from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header, read_places
-from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
+from taichi_mrf.methods.map_file import (
+    MapHeader,
+    StoredKeyframe,
+    open_map_file,
+    read_bricks,
+    read_header,
+    read_places,
+)
+from taichi_mrf.methods.mrf.frozen_arrays import (
+    color_arrays,
+    dated_arrays,
+    ray_arrays,
+    read_color_share,
+    read_dated,
+    read_rays,
+)
+from taichi_mrf.methods.mrf.inferring import show
+from taichi_mrf.methods.mrf.kept_rays import RayShare
+from taichi_mrf.methods.mrf.moving_window import MovingWindow
+from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.atomic import write_npz
-from taichi_mrf.system.npz_file import NpzFile
-from taichi_mrf.voxels.distance_field import VALUES
-from taichi_mrf.voxels.layout import VOXELS, grid_keys
-from taichi_mrf.voxels.topology import SparseTopology
-
-_SHARE = ("bricks", "numbers", "rg", "bw")
-
-_BEFORE_ALL = float(np.finfo(np.float64).min)
-"""Stands for no stamp at all: a file holds finite numbers only."""
+from taichi_mrf.voxels.layout import VOXELS
 
 
 @dataclass(frozen=True)
@@ -60,21 +64,22 @@ class MapContents:
     kept: RayShare
 
 
-def contents_of(
-    header: MapHeader,
-    registry: BrickRegistry,
-    keyframes: Iterable[Keyframe],
-    frozen: dict[int, str],
-    parked: Sequence[str] = (),
-    dated: DatedBelief | None = None,
-    colors: MapColors | None = None,
-    kept: KeptRays | None = None,
-) -> MapContents:
-    """The contents to store; ``keyframes`` are those that are not frozen."""
-    pool = registry.pool
+def save(m: OccupancyMap, parts: MapParts, next_id: int, path: Path, window: MovingWindow | None) -> None:
+    """MRFMap.save; ``window`` is the map's, if it has one."""
+    stored = [StoredKeyframe.of(keyframe) for keyframe in parts.keyframes.values()]
+    header = MapHeader(m.config, m.noise, stored, next_id, parts.settled, m.up)
+    parked = [] if window is None else window.save_beside(path, m)
+    write_contents(path, contents_of(header, parts, parked))
+    if window is not None:
+        window.saved(path)
+
+
+def contents_of(header: MapHeader, parts: MapParts, parked: list[str]) -> MapContents:
+    """The contents to store; ``parked`` names the files of the chunks that are not in memory."""
+    registry, pool, dated = parts.registry, parts.pool, parts.dated
     slots = pool.in_order
     live = np.zeros(pool.capacity, np.int32)
-    for keyframe in keyframes:
+    for keyframe in parts.keyframes.values():
         live[registry.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
     return MapContents(
         header,
@@ -85,12 +90,43 @@ def contents_of(
         None if dated is None else dated.read_frozen(slots),
         pool.owners[slots] - live[slots],
         registry.frozen_crossed,
-        frozen,
-        list(parked),
-        np.zeros((0, VOXELS, 4), np.uint8) if colors is None else colors.stored(slots, header.settled),
-        ColorShare.nothing() if colors is None else colors.frozen,
-        RayShare.nothing() if kept is None else kept.share,
+        parts.frozen,
+        parked,
+        parts.colors.stored(slots, header.settled),
+        parts.colors.frozen,
+        parts.kept.share,
     )
+
+
+def place_contents(contents: MapContents, parts: MapParts) -> NDArray[np.int32]:
+    """Place keyframes, and what frozen ones have left, in an empty map; returns the slots of the bricks."""
+    slots = np.zeros(0, np.int32)
+    if len(contents.bricks):
+        slots = parts.registry.restore(contents.bricks, contents.frozen_owners)
+    parts.registry.see_for_good(contents.frozen_crossed)
+    parts.colors.restore(contents.frozen_colors)
+    parts.kept.restore(contents.kept)
+    parts.frozen = dict(contents.frozen)
+    for k in contents.header.keyframes:
+        image = parts.image(contents.header.noise, k.depth_m, k.camera, k.color, **k.own.arguments())
+        placed = (image, k.T_world_camera, k.stamp_s)
+        parts.keyframes[k.id] = parts.allocator.place(k.id, k.name, *placed)
+    return slots
+
+
+def show_contents(contents: MapContents, parts: MapParts, slots: NDArray[np.int32]) -> None:
+    """Let queries read the beliefs of a file whose bricks and keyframes are placed."""
+    pool, dated = parts.pool, parts.dated
+    if len(slots):
+        if contents.evidence is not None:
+            pool.write("evidence", slots, contents.evidence)
+        if dated is not None and contents.frozen_dated is not None:
+            dated.restore_frozen(slots, *contents.frozen_dated)
+        show(parts, slots, contents.belief)
+        if dated is not None and contents.total is not None:
+            pool.write("total", slots, contents.total)
+        parts.colors.show(slots, contents.colors)
+    parts.messages_lost, parts.settled = bool(parts.keyframes), contents.header.settled
 
 
 def write_contents(path: Path, contents: MapContents) -> None:
@@ -145,65 +181,3 @@ def read_contents(path: Path) -> MapContents:
             read_color_share(path, file, bricks),
             read_rays(path, file),
         )
-
-
-def dated_arrays(belief: NDArray[np.float32], stamps: NDArray[np.float64]) -> dict[str, NDArray]:
-    """Arrays of a file: beliefs of frozen keyframes in some bricks, (n, 512), and as of when, (n)."""
-    return {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
-
-
-def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-    """Beliefs of frozen keyframes in a file's bricks, and as of when; None if it has none."""
-    if "frozen_belief" not in file:
-        return None
-    belief = file.array("frozen_belief", "f", (bricks, VOXELS))
-    stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
-    return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)
-
-
-def color_arrays(share: ColorShare) -> dict[str, NDArray]:
-    """Arrays of a file: colours by frozen keyframes; none without any."""
-    arrays: dict[str, NDArray] = {f"frozen_color_{name}": getattr(share, name) for name in _SHARE}
-    return arrays if len(share.numbers) else {}
-
-
-def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> ColorShare:
-    """Colours by frozen keyframes, from a file with bricks (n, 3). Raises MapFileError if it names others."""
-    if "frozen_color_numbers" not in file:
-        return ColorShare.nothing()
-    numbers = file.integers("frozen_color_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
-    n, span = len(numbers), SparseTopology.HALF_SPAN
-    share = ColorShare(
-        file.integers("frozen_color_bricks", (n, 3), -span, span - 1).astype(np.int32),
-        numbers,
-        file.array("frozen_color_rg", "i", (n,)).astype(np.int64),
-        file.array("frozen_color_bw", "i", (n,)).astype(np.int64),
-    )
-    known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
-    if not known or (share.bw <= 0).any():
-        raise MapFileError(f"{path}: damaged: frozen_color_bricks or frozen_color_bw are not of its voxels")
-    return share
-
-
-def ray_arrays(share: RayShare) -> dict[str, NDArray]:
-    """Arrays of a file: rays of frozen keyframes; none without any."""
-    arrays: dict[str, NDArray] = {}
-    for name, found in (("distance", share.distances), ("vote", share.votes)):
-        if len(found.bricks):
-            arrays |= {f"frozen_{name}_bricks": found.bricks, f"frozen_{name}_sums": found.sums}
-    return arrays
-
-
-def read_rays(path: Path, file: NpzFile) -> RayShare:
-    """Rays of frozen keyframes in a file. Raises MapFileError for sums that no keyframes have left."""
-    return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", 1))
-
-
-def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
-    if f"frozen_{name}_bricks" not in file:
-        return BrickSums.nothing(values)
-    bricks = read_places(path, file, f"frozen_{name}_bricks")
-    sums = file.integers(f"frozen_{name}_sums", (len(bricks), VOXELS, values), -LARGEST, LARGEST)
-    if (values == VALUES and (sums[..., 0] < 0).any()) or (np.diff(grid_keys(bricks)) <= 0).any():
-        raise MapFileError(f"{path}: damaged: frozen_{name}_bricks or _sums are not in order")
-    return BrickSums(bricks, sums.astype(np.int32))

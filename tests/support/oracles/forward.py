@@ -72,24 +72,3 @@ class Noise:
         high = (measured_ - near_ - self.bias_at(near_)) / sigma
         low = (measured_ - far_ - self.bias_at(far_)) / sigma
         return normal_between(low, high) / (sigma * (high - low))
-
-
-@dataclass(frozen=True)
-class TailedNoise(Noise):
-    """A ``share`` of the measurements has ``widths`` times the sigma, taken at a segment's middle."""
-
-    share: float = 0.0
-    widths: float = 1.0
-
-    def density_at(self, measured: ArrayLike, depth: ArrayLike) -> NDArray[np.float64]:
-        return self._mixed(super().density_at(measured, depth), measured, depth)
-
-    def density_over(self, measured: ArrayLike, near: ArrayLike, far: ArrayLike) -> NDArray[np.float64]:
-        middle = 0.5 * (np.asarray(near, np.float64) + np.asarray(far, np.float64))
-        return self._mixed(super().density_over(measured, near, far), measured, middle)
-
-    def _mixed(
-        self, density: NDArray[np.float64], measured: ArrayLike, depth: ArrayLike
-    ) -> NDArray[np.float64]:
-        wide = normal_density(self.deviation(measured, depth) / self.widths)
-        return (1 - self.share) * density + self.share * wide / (self.widths * self.sigma_at(depth))

@@ -1,10 +1,12 @@
-"""A stand-in for the motion sensor of Intel's RealSense library: a gyroscope and an accelerometer that are
-turned against the depth camera, and send their samples as soon as they are started."""
+"""A stand-in for Intel's RealSense library: what cameras and their recordings have in common, and a motion
+sensor, a gyroscope and an accelerometer that are turned against the depth camera."""
 
+import sys
 from collections.abc import Callable
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
+import pytest
 
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.sensor.acceleration import GRAVITY
@@ -22,9 +24,59 @@ PLACE_M = (0.01, -0.02, 0.03)
 CLOCK = "global time"
 
 
+STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+"""The depth image of a camera of 4 x 3 pixels, in steps of half a millimetre."""
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
+    """A pyrealsense2 with these names and the ones that tell kinds apart."""
+    module = ModuleType("pyrealsense2")
+    streams = SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel")
+    formats = SimpleNamespace(z16="z16", rgb8="rgb8")
+    module.__dict__.update(stream=streams, format=formats, align=Align, **names)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+
+
+def profile_of(width: int = 4, height: int = 3, **of_device: object) -> SimpleNamespace:
+    """What a pipeline gives as it starts."""
+    intrinsics = SimpleNamespace(width=width, height=height, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
+    video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
+    sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
+    return SimpleNamespace(
+        get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
+        get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, **of_device),
+    )
+
+
+def depth_image(steps: np.ndarray, stamp_s: float, number: int) -> SimpleNamespace:
+    return SimpleNamespace(
+        get_data=lambda: steps,
+        get_timestamp=lambda: 1000.0 * stamp_s,
+        get_frame_number=lambda: number,
+        get_frame_timestamp_domain=lambda: CLOCK,
+    )
+
+
+class Align:
+    """Gives each image the colours that come with its frames."""
+
+    def __init__(self, to: str) -> None:
+        assert to == "depth"
+
+    def process(self, frames: SimpleNamespace) -> SimpleNamespace:
+        color = SimpleNamespace(get_data=lambda: frames.colors)
+        return SimpleNamespace(get_depth_frame=frames.get_depth_frame, get_color_frame=lambda: color)
+
+
+def sensors(motion: "MotionSensor | None") -> list[object]:
+    """Of a device: depth, and motion if it has it."""
+    depth = SimpleNamespace(get_stream_profiles=lambda: [SimpleNamespace(stream_type=lambda: "depth")])
+    return [depth] if motion is None else [depth, motion]
+
+
 class MotionSensor:
-    """Sends samples from ``begin_s`` to ``end_s``. With ``problem`` it cannot be opened; ``shake`` is added
-    to accelerations (m/s^2)."""
+    """Sends samples from ``begin_s`` to ``end_s`` as soon as it is started. With ``problem`` it cannot be
+    opened; ``shake`` is added to accelerations (m/s^2)."""
 
     def __init__(self, begin_s: float, end_s: float, clock: str = CLOCK, shake: float = 0.0) -> None:
         self.begin_s, self.end_s, self.clock, self.shake = begin_s, end_s, clock, shake

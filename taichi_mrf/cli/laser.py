@@ -1,37 +1,139 @@
 """Command ``taichi-mrf laser``: read scans, build the graph, solve it, judge, write, print."""
 
+import csv
 import dataclasses
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import taichi_mrf
-from taichi_mrf.cli.laser.files import Outcome, write_comparison, write_energies, write_outcome
 from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.config.text import commented_yaml
-from taichi_mrf.datasets.laser.plan_image import read_floor_plan
+from taichi_mrf.datasets.laser.plan_image import FloorPlan, read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.laser.floor_plan_frame import Registration, register
-from taichi_mrf.evaluation.laser.floor_plan_scores import CellScores, floor_plan_scores, true_cells
+from taichi_mrf.evaluation.laser.floor_plan_scores import (
+    CellScores,
+    FloorPlanScores,
+    floor_plan_scores,
+    true_cells,
+)
 from taichi_mrf.evaluation.laser.laser_map import LaserMap
+from taichi_mrf.evaluation.pictures.laser_pictures import (
+    comparison_figure,
+    energy_figure,
+    map_figure,
+    method_name,
+)
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
+from taichi_mrf.export.map_server import grey_image, write_map_server
 from taichi_mrf.factor_graph.beams import Grid
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.solve import Solution, Step, solve
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
-from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.atomic import atomic_path, write_npz, write_text
 from taichi_mrf.system.memory import peak_memory_mb
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DPI = 120
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """Result of one method."""
+
+    solution: Solution
+    map: LaserMap
+    scores: FloorPlanScores | None
+    """None without a floor plan."""
+
+
+def write_result(
+    folder: Path, name: str, method: str, outcome: MethodResult, way_x_y: NDArray[np.float64]
+) -> list[Path]:
+    """Write the map and the energies of one method into a folder; returns the paths. Raises MapFileError."""
+    laser_map = outcome.map
+    image = grey_image(laser_map.occupied, laser_map.seen)
+    paths = write_map_server(folder, image, laser_map.cell_size, laser_map.lower_x_y)
+    paths.append(_write_marginals(folder / "marginals.npz", laser_map))
+    title = f"{name}: {method_name(method)}"
+    paths.append(_write_figure(folder / "map.png", map_figure(laser_map, way_x_y, title)))
+    return paths + write_energies(folder, name, {method: outcome})
+
+
+def write_energies(folder: Path, name: str, outcomes: Mapping[str, MethodResult]) -> list[Path]:
+    """Write ``energy.csv`` (with a column for the method, if there are several) and ``energy.png``."""
+    write_text(folder / "energy.csv", energy_csv(outcomes))
+    traces, duals = {}, {}
+    for method, outcome in outcomes.items():
+        trace = outcome.solution.trace
+        traces[method] = [(step.seconds, step.energy) for step in trace]
+        duals[method] = [(step.seconds, step.dual) for step in trace if step.dual is not None]
+    return [
+        folder / "energy.csv",
+        _write_figure(folder / "energy.png", energy_figure(traces, duals, f"{name}: energy against time")),
+    ]
+
+
+def write_comparison(
+    folder: Path, maps: Mapping[str, LaserMap], way_x_y: NDArray[np.float64], plan: FloorPlan | None
+) -> list[Path]:
+    """Write ``maps.png``, in which the floor plan and all maps stand side by side."""
+    return [_write_figure(folder / "maps.png", comparison_figure(maps, way_x_y, plan))]
+
+
+def energy_csv(outcomes: Mapping[str, MethodResult]) -> str:
+    """Seconds, iteration, energy and dual of every step; a dual that a method does not have is left empty."""
+    several = len(outcomes) > 1
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*(["method"] if several else []), "seconds", "iteration", "energy", "dual"])
+    for method, outcome in outcomes.items():
+        for step in outcome.solution.trace:
+            values = [
+                f"{step.seconds:.6f}",
+                step.iteration,
+                step.energy,
+                "" if step.dual is None else step.dual,
+            ]
+            writer.writerow([*([method] if several else []), *values])
+    return out.getvalue()
+
+
+def _write_marginals(path: Path, laser_map: LaserMap) -> Path:
+    arrays: dict[str, NDArray[Any]] = {
+        "labels": laser_map.occupied.astype(np.uint8),
+        "seen": laser_map.seen,
+        "cell_size": np.array(laser_map.cell_size),
+        "origin": np.array(laser_map.lower_x_y),
+    }
+    if laser_map.marginals is not None:
+        arrays["marginals"] = laser_map.marginals
+    write_npz(path, arrays)
+    return path
+
+
+def _write_figure(path: Path, figure: "Figure") -> Path:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+    return path
+
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.json"
 
@@ -68,7 +170,7 @@ def run_laser(options: Laser) -> int:
         interrupted = request()
         report = laser_report(options.scans, scans, graph, outcomes, registration, seconds, interrupted)
         write_text(options.out / REPORT_FILE, report_json(report))
-        status = 0 if request.signal is None else 128 + request.signal
+        status = request.exit_status
         if options.json:
             print(report_json(report), end="")
             return status
@@ -111,9 +213,9 @@ def _solve_all(
     registration: Registration | None,
     bar: ProgressBar,
     request: StopRequest,
-) -> dict[str, Outcome]:
+) -> dict[str, MethodResult]:
     """Each run's outcome, until the run is to stop: that of the first is kept in any case."""
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, MethodResult] = {}
     for name, settings in options.runs().items():
         if outcomes and request():
             break
@@ -124,7 +226,7 @@ def _solve_all(
         if registration is not None:
             truth = true_cells(registration.plan, laser_map, scans.pose_x_y_theta[:, :2])
             scores = floor_plan_scores(laser_map, truth)
-        outcomes[name] = Outcome(solution, laser_map, scores)
+        outcomes[name] = MethodResult(solution, laser_map, scores)
     return outcomes
 
 
@@ -154,7 +256,7 @@ def _laser_map(graph: FactorGraph, solution: Solution) -> LaserMap:
 
 
 def _write(
-    options: Laser, scans: LaserScans, outcomes: dict[str, Outcome], registration: Registration | None
+    options: Laser, scans: LaserScans, outcomes: dict[str, MethodResult], registration: Registration | None
 ) -> list[Path]:
     """The maps first: they are what the time went into."""
     way = scans.pose_x_y_theta[:, :2]
@@ -163,7 +265,7 @@ def _write(
     for name, outcome in outcomes.items():
         folder = options.out / name if several else options.out
         folder.mkdir(exist_ok=True)
-        written += write_outcome(folder, scans.name, name, outcome, way)
+        written += write_result(folder, scans.name, name, outcome, way)
     if several:
         written += write_energies(options.out, scans.name, outcomes)
         maps = {name: outcome.map for name, outcome in outcomes.items()}
@@ -185,7 +287,7 @@ def laser_report(
     source: str,
     scans: LaserScans,
     graph: FactorGraph,
-    outcomes: Mapping[str, Outcome],
+    outcomes: Mapping[str, MethodResult],
     registration: Registration | None,
     seconds: Mapping[str, float],
     interrupted: bool,
@@ -216,7 +318,7 @@ def laser_report(
     }
 
 
-def comparison_table(name: str, outcomes: Mapping[str, Outcome]) -> Table:
+def comparison_table(name: str, outcomes: Mapping[str, MethodResult]) -> Table:
     """A row for each method, in the order in which they ran."""
     judged = any(outcome.scores for outcome in outcomes.values())
     columns = ["method", "energy", "dual bound", "seconds", "explained %"]
@@ -246,12 +348,12 @@ def _entries(scores: CellScores) -> list[Entry]:
     return [scores.precision, scores.recall, scores.iou]
 
 
-def _seconds(outcome: Outcome) -> float:
+def _seconds(outcome: MethodResult) -> float:
     trace = outcome.solution.trace
     return trace[-1].seconds if trace else 0.0
 
 
-def _method_report(outcome: Outcome) -> dict[str, Any]:
+def _method_report(outcome: MethodResult) -> dict[str, Any]:
     solution = outcome.solution
     return {
         "energy": solution.energy,

@@ -1,4 +1,4 @@
-"""``taichi-mrf bench``: how long each stage takes here, and how long OctoMap takes for the same."""
+"""The options of the commands that measure: bench the speed here, eval the papers' tables."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.cli.options.shared import Verbosity, check_least
-from taichi_mrf.config.schema import Config
+from taichi_mrf.config.schema import Config, RuntimeConfig
 from taichi_mrf.errors import ConfigError
 
 MODES = ("viewer", "profile", "growth", "queries")
@@ -70,3 +70,55 @@ class Bench:
                 raise ConfigError(f"--plot does not go with --{mode}")
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Repeat an evaluation of the papers, and print it beside what they report.
+
+    Tables are written as CSV, LaTeX and PNG, with the configuration of every map. An
+    interrupted run continues when it is started again with the same --out.
+    Example: taichi-mrf eval table1 --data scenes/ --voxel-sizes 0.05 --limit 3
+    """
+
+    experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
+    """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
+    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates (Dhiman et al. 2014),
+    peers, which compares all mappers that are installed, or all."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
+    """Folder for the results; created if needed."""
+
+    data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
+    """Folder with the scenes, as data/README.md describes them."""
+
+    voxel_sizes: tuple[float, ...] = ()
+    """Voxel sizes in metres, instead of the experiment's own."""
+
+    seeds: tuple[int, ...] = (0, 1, 2, 3)
+    """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
+
+    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Use at most N views or folds, for a quick look."""
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
+    """Run only these parts of the experiment peers, such as 'kitchen*'."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
+
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+    """Device that runs the kernels."""
+
+    def __post_init__(self) -> None:
+        check_least(self, limit=1)
+        if not self.seeds:
+            raise ConfigError("--seeds needs at least one number")
+        if min(self.seeds) < 0:
+            raise ConfigError(f"--seeds must not be negative, not {min(self.seeds)}")
+        for name, values in (("seeds", self.seeds), ("voxel-sizes", self.voxel_sizes)):
+            if len(set(values)) < len(values):
+                raise ConfigError(f"--{name} must differ from each other, not {values}")
+        for size in self.voxel_sizes:
+            if not 0 < size < float("inf"):
+                raise ConfigError(f"--voxel-sizes must be positive numbers of metres, not {size}")

@@ -1,0 +1,84 @@
+"""The contributions of frozen keyframes as arrays of a file, a map's or a parked chunk's."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
+from taichi_mrf.inference.color_sums import ColorShare
+from taichi_mrf.inference.dated_channels import NEVER
+from taichi_mrf.methods.map_file import read_places
+from taichi_mrf.methods.mrf.kept_rays import RayShare
+from taichi_mrf.system.npz_file import NpzFile
+from taichi_mrf.voxels.distance_field import VALUES
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
+from taichi_mrf.voxels.topology import SparseTopology
+
+_SHARE = ("bricks", "numbers", "rg", "bw")
+
+_BEFORE_ALL = float(np.finfo(np.float64).min)
+"""Stands for no stamp at all: a file holds finite numbers only."""
+
+
+def dated_arrays(belief: NDArray[np.float32], stamps: NDArray[np.float64]) -> dict[str, NDArray]:
+    """Arrays of a file: beliefs of frozen keyframes in some bricks, (n, 512), and as of when, (n)."""
+    return {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
+
+
+def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
+    """Beliefs of frozen keyframes in a file's bricks, and as of when; None if it has none."""
+    if "frozen_belief" not in file:
+        return None
+    belief = file.array("frozen_belief", "f", (bricks, VOXELS))
+    stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
+    return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)
+
+
+def color_arrays(share: ColorShare) -> dict[str, NDArray]:
+    """Arrays of a file: colours by frozen keyframes; none without any."""
+    arrays: dict[str, NDArray] = {f"frozen_color_{name}": getattr(share, name) for name in _SHARE}
+    return arrays if len(share.numbers) else {}
+
+
+def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> ColorShare:
+    """Colours by frozen keyframes, from a file with bricks (n, 3). Raises MapFileError if it names others."""
+    if "frozen_color_numbers" not in file:
+        return ColorShare.nothing()
+    numbers = file.integers("frozen_color_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
+    n, span = len(numbers), SparseTopology.HALF_SPAN
+    share = ColorShare(
+        file.integers("frozen_color_bricks", (n, 3), -span, span - 1).astype(np.int32),
+        numbers,
+        file.array("frozen_color_rg", "i", (n,)).astype(np.int64),
+        file.array("frozen_color_bw", "i", (n,)).astype(np.int64),
+    )
+    known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
+    if not known or (share.bw <= 0).any():
+        raise MapFileError(f"{path}: damaged: frozen_color_bricks or frozen_color_bw are not of its voxels")
+    return share
+
+
+def ray_arrays(share: RayShare) -> dict[str, NDArray]:
+    """Arrays of a file: rays of frozen keyframes; none without any."""
+    arrays: dict[str, NDArray] = {}
+    for name, found in (("distance", share.distances), ("vote", share.votes)):
+        if len(found.bricks):
+            arrays |= {f"frozen_{name}_bricks": found.bricks, f"frozen_{name}_sums": found.sums}
+    return arrays
+
+
+def read_rays(path: Path, file: NpzFile) -> RayShare:
+    """Rays of frozen keyframes in a file. Raises MapFileError for sums that no keyframes have left."""
+    return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", 1))
+
+
+def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
+    if f"frozen_{name}_bricks" not in file:
+        return BrickSums.nothing(values)
+    bricks = read_places(path, file, f"frozen_{name}_bricks")
+    sums = file.integers(f"frozen_{name}_sums", (len(bricks), VOXELS, values), -LARGEST, LARGEST)
+    if (values == VALUES and (sums[..., 0] < 0).any()) or (np.diff(grid_keys(bricks)) <= 0).any():
+        raise MapFileError(f"{path}: damaged: frozen_{name}_bricks or _sums are not in order")
+    return BrickSums(bricks, sums.astype(np.int32))

@@ -1,0 +1,120 @@
+"""Inference in an MRFMap: which keyframes are swept, from which messages, and how a stopped run is undone.
+
+Full inference starts by dropping all messages. A caller that may have to stop it, to carry out an edit for
+instance, takes a checkpoint first: the beliefs, which queries can keep reading (BrickPool.showing), and the
+messages behind them. Between checkpoint and return no keyframe may be added, removed or moved.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.inference.keyframe import VisibleBricks
+from taichi_mrf.inference.schedule import InferSteps, content_key, driven, sweep_steps
+from taichi_mrf.inference.sweep import unknown_entry_depths
+from taichi_mrf.methods.brick_map import check_inference
+from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import PoolSnapshot
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A map's beliefs, and for each keyframe its visible bricks, its messages for them, and the bricks'
+    change counts at its last sweep."""
+
+    pool: PoolSnapshot
+    messages: dict[int, "tuple[VisibleBricks, ti.Ndarray | None, NDArray[np.int64] | None]"]
+    messages_lost: bool
+    settled: bool
+
+
+def infer_steps(
+    parts: MapParts,
+    sweeps: int | None = None,
+    tolerance: float | None = None,
+    keyframes: Iterable[int] | None = None,
+) -> InferSteps:
+    """MRFMap.infer_steps."""
+    chosen_ids = check_inference(sweeps, tolerance, keyframes)
+    configured = parts.config.inference.sweeps
+    sweeps, tolerance = configured if sweeps is None else sweeps, tolerance or 0.0
+    pool, dated = parts.pool, parts.dated
+    if chosen_ids is None:
+        chosen = sorted(parts.keyframes.values(), key=content_key)
+        pool.restart()
+        for keyframe in chosen:
+            # Entry depths of earlier sweeps would change the rounding of rays, so they start over too.
+            keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
+            keyframe.entry_depths_known = False
+            keyframe.messages = None
+            parts.allocator.refresh(keyframe)
+        parts.messages_lost = False
+    else:
+        chosen = [parts.find(id) for id in chosen_ids]
+        restore_messages(parts)
+        for keyframe in chosen:
+            parts.allocator.refresh(keyframe)
+    for keyframe in chosen:
+        pool.touch(keyframe.visible.slots)
+    as_configured = chosen_ids is None and (sweeps, tolerance) == (configured, 0.0)
+    complete = False
+    try:
+        note = None if dated is None or chosen_ids is None else dated.note_sweep
+        report = yield from sweep_steps(chosen, pool, parts.sweeper, sweeps, tolerance, note)
+        complete = report.complete
+    finally:
+        parts.settled = complete and as_configured
+        if dated is not None and chosen_ids is None:
+            dated.outdate()
+    return report
+
+
+def restore_messages(parts: MapParts) -> None:
+    """Compute the messages of a loaded map: its file holds none, because they follow from the images."""
+    if parts.messages_lost:
+        driven(infer_steps(parts), None)
+
+
+def show(parts: MapParts, slots: NDArray[np.int32], log_odds: NDArray[np.float32]) -> None:
+    """Let queries read these log-odds, (n) -> (n, 512), until the next inference."""
+    parts.pool.write("total", slots, log_odds)
+    if parts.dated is not None:
+        parts.dated.show(slots, log_odds, parts.dated.now_s)
+
+
+def adopt(parts: MapParts, log_odds: NDArray[np.float32]) -> None:
+    """MRFMap.adopt."""
+    parts.pool.restart()
+    for keyframe in parts.keyframes.values():
+        keyframe.messages = None
+    parts.allocator.mark_without_messages(parts.keyframes.values())
+    show(parts, parts.pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
+    parts.messages_lost, parts.settled = bool(parts.keyframes), False
+
+
+def take_checkpoint(parts: MapParts) -> Checkpoint:
+    """Copy the beliefs. The messages need no copy because full inference starts with new arrays."""
+    return Checkpoint(
+        parts.pool.snapshot(),
+        {k.id: (k.visible, k.messages, k.change_count_at_last_sweep) for k in parts.keyframes.values()},
+        parts.messages_lost,
+        parts.settled,
+    )
+
+
+def go_back(parts: MapParts, checkpoint: Checkpoint) -> None:
+    """Restore beliefs and messages as of the checkpoint."""
+    parts.pool.restore(checkpoint.pool)
+    for keyframe in parts.keyframes.values():
+        keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = checkpoint.messages[
+            keyframe.id
+        ]
+        keyframe.pending_visible = None
+    parts.messages_lost, parts.settled = checkpoint.messages_lost, checkpoint.settled
+    parts.allocator.mark_without_messages(parts.keyframes.values())
+    if parts.dated is not None:
+        parts.dated.outdate()

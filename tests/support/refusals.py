@@ -1,0 +1,30 @@
+"""Errors in one line, and sources that cannot be opened."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
+
+
+@contextmanager
+def refusal(kind: type[TaichiMRFError], *words: str) -> Iterator[pytest.ExceptionInfo[TaichiMRFError]]:
+    """What is done here is refused in one line, which holds these words."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    said = str(caught.value)
+    assert "\n" not in said
+    for each in words:
+        assert each in said
+
+
+def refused(source: str | Path, *words: str, **options: Any) -> str:
+    """What is said of a source that cannot be opened: one line, which holds these words."""
+    with refusal(DatasetError, *words) as caught:
+        open_dataset(source, **options)
+    assert not isinstance(caught.value, FrameError)
+    return str(caught.value)
