@@ -58,7 +58,7 @@ PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
 _NO_METRES = 250.0
 """A median of floats above this is one of millimetres."""
 
-_STEPS, _LONG_STEP_M = 8, 2.0
+_STEPS, _LONG_STEP_M = 8, 5.0
 _PLACES = 4
 _LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 1.0
 _FARTHEST_NEIGHBOUR = 60
@@ -100,7 +100,7 @@ def check_metres(depths: Sequence[Image], where: str) -> None:
 
 def out_of_sight(dataset: Dataset) -> str:
     """Why neighbouring frames hardly see the same, if the sensor moves farther between them than it sees."""
-    frames = [int(i) for i in np.unique(np.linspace(0, len(dataset) - 2, _STEPS).astype(int)) if i >= 0]
+    frames = range(0, len(dataset) - 1, max(1, len(dataset) // _STEPS))
     steps_m, far_m = [], []
     for i in frames:
         with suppress(DatasetError):
