@@ -15,16 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import instance, iterable, real, seconds, whole
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
-from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import Answer, View
+from taichi_mrf.queries.survey import Occlusion
+from taichi_mrf.queries.view import Answer, RayProfile, View
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence

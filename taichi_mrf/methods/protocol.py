@@ -13,8 +13,7 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
-from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import Answer, View
+from taichi_mrf.queries.view import Answer, RayProfile, View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import OwnEvidence
