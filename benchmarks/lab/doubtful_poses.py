@@ -22,7 +22,8 @@ from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.geometry.poses import Pose, inverse
-from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.pose_doubt import Covariance, DoubtfulPose, covariance_of
 
 EXACT, DOUBTFUL = "as if exact", "with covariance"
@@ -102,7 +103,7 @@ def recording(scene: Scene, voxel_size: float, seed: int) -> Result:
     return result
 
 
-def how_far_off(m: AligningMap, scene: Scene, asked: Iterable[int]) -> tuple[float, float]:
+def how_far_off(m: MRFMap, scene: Scene, asked: Iterable[int]) -> tuple[float, float]:
     """How far views that are not in the map move when they are aligned with it: RMS along each axis in
     metres, and about each axis in radians."""
     views = [scene.views[i] for i in asked]
@@ -113,7 +114,7 @@ def how_far_off(m: AligningMap, scene: Scene, asked: Iterable[int]) -> tuple[flo
 
 
 def figures(
-    m: AligningMap, scene: Scene, judged: Iterable[int], covariance: Covariance | None = None
+    m: MRFMap, scene: Scene, judged: Iterable[int], covariance: Covariance | None = None
 ) -> dict[str, float]:
     """Means over views, and the calibration over all their measurements. ``covariance`` (6, 6) is that of the
     views' poses, None for exact ones."""
@@ -142,7 +143,7 @@ def figures(
 
 def _built(
     scene: Scene, voxel_size: float, poses: Mapping[int, Pose], covariances: Mapping[int, Covariance]
-) -> AligningMap:
+) -> MRFMap:
     m = mrf().make(scene, voxel_size)
     assert can_refine_poses(m)
     for i, T_world_camera in poses.items():

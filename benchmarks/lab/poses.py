@@ -26,7 +26,8 @@ from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, kitchen
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
-from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.simulate import KINECT_1
 
 DISTURBED_M, DISTURBED_RAD = 0.02, np.radians(1.0)
@@ -158,7 +159,7 @@ def build_and_judge(case: Case, scene: Scene, voxel_size: float) -> Result:
     return result | {"rotation_rad": rotation.tolist(), "translation_m": translation.tolist()}
 
 
-def aligned(m: AligningMap, scene: Scene, view: SceneView) -> SceneView:
+def aligned(m: MRFMap, scene: Scene, view: SceneView) -> SceneView:
     """A view from where it fits the map, which stays as it is."""
     keyframe = m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
     T_world_camera = m.refine_pose(keyframe).T_world_camera

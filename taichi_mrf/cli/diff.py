@@ -10,11 +10,14 @@ from taichi_mrf.cli.options.saved_maps import Diff
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.changes import write_changes
+from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import MapPart, in_chunks, take_part
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.queries.change import STATES, MapChange, compare_maps
 from taichi_mrf.system import runtime
+from taichi_mrf.system.files import is_folder
 
 
 def run_diff(options: Diff) -> int:
@@ -39,6 +42,8 @@ def run_diff(options: Diff) -> int:
 
 def _whole(path: Path) -> OccupancyMap | MapPart:
     """A saved map, with what is outside of its window."""
+    if is_folder(path) and path.suffix == SUFFIX:
+        return take_part(ChunkedMap.open(path))
     m = load_map(path)
     chunked = in_chunks(m)
     return m if chunked is None else take_part(chunked)

@@ -67,24 +67,23 @@ class Method:
     """The parameters of its section that the tuning page offers, in the order of the page."""
 
     has_messages: bool = False
-    """Keyframes keep messages (methods.protocol.MessageMap): a change is renewed without starting over, and
+    """Keyframes keep messages (methods/capabilities.py): a change is renewed without starting over, and
     inference that was stopped can be undone. A map that was loaded has to infer before it can be edited."""
 
     can_freeze: bool = False
-    """Keyframes can be folded into the map for good (methods.protocol.FreezingMap)."""
+    """Keyframes can be folded into the map for good."""
 
     can_refine_poses: bool = False
-    """Keyframes can be aligned with the map (methods.protocol.AligningMap): pose refinement and tracking."""
+    """Keyframes can be aligned with the map: pose refinement and tracking."""
 
     has_layers: bool = False
-    """Its map of a world that may change can be read as of another time and by layers
-    (methods.capabilities.LayeredMap)."""
+    """Its map of a world that may change can be read as of another time and by layers."""
 
     has_colors: bool = False
-    """Keyframes may have colour images, and voxels then have colours (methods.capabilities.ColoredMap)."""
+    """Keyframes may have colour images, and voxels then have colours."""
 
     measures_surface: bool = False
-    """Makes the surface that its keyframes measured (methods.capabilities.MeasuringMap)."""
+    """Makes the surface that its keyframes measured."""
 
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""

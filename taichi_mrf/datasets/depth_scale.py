@@ -7,12 +7,14 @@ What one frame says of the surfaces that another one saw is here too.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -56,6 +58,7 @@ PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
 _NO_METRES = 250.0
 """A median of floats above this is one of millimetres."""
 
+_STEPS, _LONG_STEP_M = 8, 5.0
 _PLACES = 4
 _LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 1.0
 _FARTHEST_NEIGHBOUR = 60
@@ -93,6 +96,28 @@ def check_metres(depths: Sequence[Image], where: str) -> None:
             f"{where}: the numbers have a median of {median:.4g}, which are hardly metres: --depth-scale "
             "1000 takes them for millimetres, --depth-scale 1 for metres all the same"
         )
+
+
+def out_of_sight(dataset: Dataset) -> str:
+    """Why neighbouring frames hardly see the same, if the sensor moves farther between them than it sees."""
+    frames = range(0, len(dataset) - 1, max(1, len(dataset) // _STEPS))
+    steps_m, far_m = [], []
+    for i in frames:
+        with suppress(DatasetError):
+            steps_m.append(float(np.linalg.norm(dataset.pose(i + 1)[:3, 3] - dataset.pose(i)[:3, 3])))
+    step_m = float(np.median(steps_m)) if steps_m else 0.0
+    if step_m < _LONG_STEP_M:  # no frame need be read
+        return ""
+    for i in frames:
+        with suppress(DatasetError):
+            depth_m = dataset.read(i).depth_m
+            far_m += [float(np.percentile(depth_m[depth_m > 0], 99))] if (depth_m > 0).any() else []
+    if not far_m or step_m <= max(far_m):
+        return ""
+    return (
+        f"the sensor moves {step_m:.3g} m from frame to frame, farther than it sees ({max(far_m):.3g} m), so "
+        "that frames do not overlap: its poses may be in another unit than its depths, such as millimetres"
+    )
 
 
 def gather(

@@ -72,6 +72,7 @@ _BY_ENDING = {
     ".active": "was not closed by its recorder; 'rosbag reindex' mends it, then call it .bag",
     ".sens": "is ScanNet's packed format; extract it to depth/, pose/ and intrinsic/ with ScanNet's tools",
 }
+_SAVED_MAP = "is a saved map, not a recording"
 _POSES_ONLY = "and no depth images"
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm")
 _LOOKED_AT = 20
@@ -85,8 +86,12 @@ def hint_for(path: Path) -> str | None:
             "contains scans of a 2D laser scanner, not depth images; map them with: "
             f"taichi-mrf laser {shlex.quote(str(path))} --out DIR"
         )
+    if path.suffix == ".zarr" and is_folder(path):
+        return f"{_SAVED_MAP}: taichi-mrf info, export and diff read it, and live shows the map.npz of a run"
     if not is_folder(path):
         return image_hint([path], "is one image") if path.suffix.lower() in _IMAGES else _kind(path)
+    if is_file(path / "map.npz"):
+        return _kind(path / "map.npz")
     children = [child for child in sorted(path.iterdir()) if is_file(child)]
     scans = [child for child in children if holds_scans(child)]
     if scans:
@@ -147,6 +152,8 @@ def _other_arrays(path: Path) -> str | None:
     try:
         with open_npz(path, DatasetError, "an npz file that can be read") as file:
             held = ", ".join(file.names[:8]) or "nothing"
+            if {"format", "keyframe_ids"} <= set(file.names):
+                return f"{_SAVED_MAP}: taichi-mrf live, export, info and diff read {path.name}"
     except DatasetError:
         return None
     return f"contains {held}, and not depth_m, T_world_camera and K of frames, nor xyz of a scan"

@@ -65,7 +65,7 @@ def origin_of(position_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def moved_note(origin_m: NDArray[np.float64]) -> str:
     """A note that the origin was moved."""
-    return "the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*origin_m)
+    return "the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*(origin_m + 0.0))
 
 
 @dataclass

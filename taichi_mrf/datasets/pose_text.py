@@ -7,8 +7,11 @@ columns of a position and a quaternion, in any order and among others (EuRoC's
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import read_text
@@ -31,6 +34,9 @@ _NANOSECONDS = re.compile(r".*[._]n(?:ano)?secs?")
 _UNITS = {"ns": 1e9, "nsec": 1e9, "nanoseconds": 1e9, "us": 1e6, "usec": 1e6, "ms": 1e3, "msec": 1e3}
 _MAGNITUDES = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
 """Numbers from the first are stamps since 1970 of so many a second."""
+
+_EARLIEST = 0.05
+"""Share of a file's stamps that may be outliers."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +102,17 @@ def numbers_in(text: str, columns: Columns | None) -> list[float]:
     return numbers
 
 
+def stamps_a_second(stamps: Sequence[float]) -> float:
+    """How many a second the stamps of one file count: 1, or a thousand and more where they are too large for
+    seconds since 1970. The earliest tell, as nanoseconds of a clock that starts at 0 become as large."""
+    sizes = np.abs(np.asarray(stamps, np.float64))
+    least = np.quantile(sizes[sizes > 0], _EARLIEST) if sizes.any() else 0.0
+    return next((rate for first, rate in _MAGNITUDES if least >= first), 1.0)
+
+
 def in_seconds(stamp: float) -> float:
-    """A stamp in seconds: what is too large for seconds since 1970 is in milli-, micro- or nanoseconds."""
-    return next((stamp / unit for least, unit in _MAGNITUDES if abs(stamp) >= least), stamp)
+    """A stamp that stands alone, in seconds."""
+    return stamp / stamps_a_second([stamp])
 
 
 def _named(head: str) -> Columns | None:

@@ -9,6 +9,7 @@ from pkgutil import resolve_name
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
+from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
 from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
@@ -108,7 +109,10 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     distortion = dataset.distortion if options.undistort is None else options.undistort
     picked = resampled(dataset, distortion, options.stride)
     picked.tracked = dataset.tracked
-    return mended(picked, conventions, options.max_time_gap)
+    asked = mended(picked, conventions, options.max_time_gap)
+    apart = "" if asked.tracked or asked.endless else out_of_sight(asked)
+    asked.notes += [f"{apart}; taichi-mrf doctor tells"] if apart else []
+    return asked
 
 
 def _path_and_query(source: str) -> tuple[Path, str]:

@@ -6,6 +6,7 @@ straight line between the neighbouring positions and on the great circle between
 in time is bounded, so that no pose is invented where a trajectory has a hole.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +23,12 @@ INTERPOLATION_GAP = 0.1
 
 _SAME = 1e-7
 """Poses differ by less, metres and elements of a rotation, where one is written again and again."""
+
+_SHORTER_UNITS = {1e3: ("ms", "milliseconds"), 1e6: ("us", "microseconds"), 1e9: ("ns", "nanoseconds")}
+"""Units by how many are a second."""
+
+_OF_ONE_TIME = 0.5
+"""Least share of the data within the time of the poses, for both to be of one recording."""
 
 _NEARLY_EQUAL = 1e-9
 """Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
@@ -45,6 +52,8 @@ def within_gap(
     and a note that counts the others. ``stamps`` are the data's, ``posed`` those of the poses in ``source``.
     Raises DatasetError, which begins with ``where``, if none has a pose."""
     found = [(i, pose) for i, pose in enumerate(poses) if pose is not None]
+    if 2 * len(found) < len(stamps):
+        check_unit(stamps, posed, what, where, source)
     if not found:
         span = f", {min(posed):.3f} to {max(posed):.3f} s" if len(posed) else ""
         raise DatasetError(
@@ -54,6 +63,34 @@ def within_gap(
     dropped = len(poses) - len(found)
     note = f"{dropped} of {len(poses)} {what} dropped: no poses within {gap:g} s on both sides"
     return found, [note] if dropped else []
+
+
+def check_unit(
+    stamps: Sequence[float] | NDArray, posed: Sequence[float] | NDArray, what: str, where: str, source: str
+) -> None:
+    """Raise DatasetError, which begins with ``where``, if the stamps of data (``what``) and of the poses in
+    ``source`` run over the same time in units that differ by a thousand, a million or a billion."""
+    s, p = np.asarray(stamps, np.float64), np.asarray(posed, np.float64)
+    spans = [float(np.ptp(each)) if len(each) else 0.0 for each in (s, p)]
+    if not all(0 < span < math.inf for span in spans):
+        return
+    power = round(math.log(spans[1] / spans[0], 1000))
+    times = 1000.0 ** abs(power)
+    s, p = (s, p / times) if power > 0 else (s / times, p)
+    if times not in _SHORTER_UNITS or ((s >= p.min()) & (s <= p.max())).mean() < _OF_ONE_TIME:
+        return
+    short, unit = _SHORTER_UNITS[times]
+    faster, slower = ("the poses", f"the {what}") if power > 0 else (f"the {what}", "the poses")
+    remedy = (
+        f"the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers says so"
+        if power > 0
+        else f"divide those of the {what} by {times:.0f}"
+    )
+    of_poses, of_data = (f"{min(each):.6g} to {max(each):.6g}" for each in (posed, stamps))
+    raise DatasetError(
+        f"{where}: the stamps of {faster} are {times:.0f} times those of {slower} ({source}: {of_poses}, "
+        f"{what}: {of_data}), as {unit} are beside seconds: {remedy}"
+    )
 
 
 def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, gap: float) -> str:

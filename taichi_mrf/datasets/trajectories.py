@@ -13,6 +13,7 @@ can still be used.
 
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +22,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.pose_text import Line, in_seconds, lines_of_numbers, numbers_in, split
+from taichi_mrf.datasets.base import start_pose
+from taichi_mrf.datasets.pose_text import Line, lines_of_numbers, numbers_in, split, stamps_a_second
 from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -29,6 +31,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
+
+OTHERWISE = "--poses FILE takes them from elsewhere, --track-poses finds them"
+"""Remedy for a recording without poses."""
 
 _UNIT_LENGTH = 0.01
 """Seven numbers are a pose if the last four are of length 1, up to so much."""
@@ -88,7 +93,8 @@ def read_trajectory(path: Path) -> Trajectory:
                 f"{left_out} of {len(lines)} poses of {path} are left out: their stamps are not finite",
                 stacklevel=2,
             )
-        poses = _longest_run(path, tuple(_stamped(path, line) for line in known))
+        rate = stamps_a_second([values[0] for _, values in known])
+        poses = _longest_run(path, tuple(_stamped(path, line, rate) for line in known))
         _warn_of_twice(path, poses)
         return Trajectory(path, "stamped", poses)
     if columns in (13, 17):  # KITTI-360: the frame's number, and the matrix
@@ -122,6 +128,12 @@ def _longest_run(path: Path, poses: tuple[RecordedPose, ...]) -> tuple[RecordedP
         stacklevel=2,
     )
     return longest
+
+
+def poses_at_start(folder: Path, layout: Layout, keys: Iterable[float]) -> Trajectory:
+    """Poses for frames that have none: they are found while mapping, or taken from elsewhere."""
+    start = start_pose()[:3]
+    return Trajectory(folder, layout, tuple(RecordedPose(key, start, str(folder)) for key in keys))
 
 
 def valid_poses(trajectory: Trajectory) -> tuple[list[float], list[Pose]]:
@@ -207,10 +219,10 @@ def rotation_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def _stamped(path: Path, line: Line) -> RecordedPose:
+def _stamped(path: Path, line: Line, rate: float) -> RecordedPose:
     number, values = line
     _expect(path, line, 8)
-    return RecordedPose(in_seconds(values[0]), np.array(values[1:], float), f"{path} line {number}")
+    return RecordedPose(values[0] / rate, np.array(values[1:], float), f"{path} line {number}")
 
 
 def _row(path: Path, index: int, line: Line) -> RecordedPose:

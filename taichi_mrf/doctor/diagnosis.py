@@ -7,8 +7,10 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
+from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
+from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.doctor.readings import POSE_UNITS, UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
@@ -66,6 +68,12 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     if isinstance(dataset, Mended):
         said = said if dataset.conventions == AS_USUAL else dataset.conventions
         dataset = dataset.source
+    elif isinstance(dataset, PosedFrames) and dataset.poses.conventions != AS_USUAL:
+        inner = dataset.source
+        said = dataset.poses.conventions
+        if isinstance(inner, Mended):
+            said, inner = replace(said, along_ray=inner.conventions.along_ray), inner.source
+        dataset = replace(dataset, source=inner, poses=dataset.poses.as_written(inner.frame_names))
     given = Reading(**asdict(said))
     source: Dataset = dataset
     while isinstance(source, Derived):
@@ -83,7 +91,8 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     if best == given and before > _CONTRADICTING:
-        return Diagnosis((), (_NO_READING,), given)
+        apart = out_of_sight(dataset)
+        return Diagnosis((Finding(apart),) if apart else (), (_NO_READING,), given)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
     if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
@@ -135,7 +144,12 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
     if best.factor != given.factor:
         right = steps / best.factor
         unit = next((name for each, name in UNITS.items() if math.isclose(each, right, rel_tol=1e-6)), "")
-        if best.factor in POSE_UNITS and unit in ("", UNITS[1.0]):  # no sensor counts whole metres
+        if unit == UNITS[1.0] and right != steps and best.factor not in POSE_UNITS:
+            text = (
+                "poses and depths are in one unit, and that is not metres: with millimetres, divide positions"
+            )
+            found.append(Finding(f"{text} by 1000", "--depth-scale 1000"))
+        elif best.factor in POSE_UNITS and unit in ("", UNITS[1.0]):  # no sensor counts whole metres
             of_poses = POSE_UNITS[best.factor]
             found.append(Finding(f"poses are in {of_poses}: divide their positions by {best.factor:g}"))
         else:

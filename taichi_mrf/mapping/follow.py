@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -97,7 +98,7 @@ class PoseFollower:
         if not wanted:
             return ()
         if has_messages(self.map):
-            options = {} if least is None else {"least": least}
+            options: dict[str, Any] = {} if least is None else {"least": least}
             update = self.map.update_poses(wanted, **options, seconds=seconds)
             moved, self._left = update.moved, dict(update.left)
         else:

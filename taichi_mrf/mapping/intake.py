@@ -186,20 +186,19 @@ class Intake:
     def _added(self, frame: Frame) -> int:
         """Add a frame as a keyframe and align it, or leave nothing of it; returns its number."""
         with self.result.timed("adding"):
-            color = frame.color if self.map.config.color else None
-            if self.map.config.color and color is None and self._expects_color:
+            if not self.map.config.color:
+                frame = replace(frame, color=None)
+            elif frame.color is None and self._expects_color:
                 self._expects_color = False
                 warnings.warn(f"frame {frame.name} has no colour image", stacklevel=2)
-            parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
-            own = frame.own_in(self.map.config)
-            if self._expects_no_return and own.no_return is None:
+            if self._expects_no_return and frame.no_return is None:
                 self._expects_no_return = False
                 warnings.warn(
                     f"frame {frame.name} does not name the pixels that got no return: sensor.no_return is "
                     f'"{self.map.sensor.no_return}" and changes nothing for it',
                     stacklevel=2,
                 )
-            keyframe = self.map.add_keyframe(frame.depth_m, *parts, **own.arguments())
+            keyframe = self.map.add(frame)
         try:
             if self.refiner is not None and self._aligns:
                 with self.result.timed("refining"):

@@ -17,7 +17,8 @@ from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
-from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 
 
@@ -51,7 +52,7 @@ class PoseRefiner:
     """Refines the keyframes of one map. If they were ``tracked``, there are no recorded poses to keep to, but
     the steps between them."""
 
-    def __init__(self, m: AligningMap, config: PoseConfig, tracked: bool = False) -> None:
+    def __init__(self, m: MRFMap, config: PoseConfig, tracked: bool = False) -> None:
         self.map, self.config, self.tracked = m, config, tracked
         self._recorded: dict[int, Pose] = {}
 

@@ -14,7 +14,7 @@ from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.schedule import InferProgress, InferSteps, StopRequestedError
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.settling import OutcomeT, Settling
-from taichi_mrf.methods.capabilities import AligningMap
+from taichi_mrf.methods.mrf.map import MRFMap
 
 LOSS = 0.1
 """Log-likelihood per pixel that a round may cost if poses were recorded. Keyframes that were aligned one
@@ -56,7 +56,7 @@ class KeyframeMover(Protocol):
 class PlainMover:
     """Moves keyframes of a map that is not shown."""
 
-    def __init__(self, m: AligningMap) -> None:
+    def __init__(self, m: MRFMap) -> None:
         self._map = m
 
     def move(self, id: int, T_world_camera: Pose) -> None:
@@ -129,7 +129,7 @@ class AlignmentRounds(Settling[RoundStep, bool]):
             self._mover.move(id, T_world_camera)
 
 
-def has_settled(m: AligningMap, stood: Mapping[int, Pose]) -> bool:
+def has_settled(m: MRFMap, stood: Mapping[int, Pose]) -> bool:
     """True if no keyframe has moved far from where it stood."""
     keyframes = m.keyframes
     moved_m = [tangent_norms(T, keyframes[id].T_world_camera)[1] for id, T in stood.items()]

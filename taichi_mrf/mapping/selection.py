@@ -5,7 +5,7 @@ import numpy as np
 
 from taichi_mrf.config.schema import KeyframeConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.methods.capabilities import FreezingMap
+from taichi_mrf.methods.mrf.map import MRFMap
 
 
 def is_held_out(number: int, hold_out: int) -> bool:
@@ -51,7 +51,7 @@ class KeyframeSelector:
         return turned or moved
 
 
-def surplus(m: FreezingMap, newest: int, keep: int) -> list[int]:
+def surplus(m: MRFMap, newest: int, keep: int) -> list[int]:
     """The keyframes (ids) beyond ``keep`` to freeze, so that an endless run is bounded in time and memory.
 
     Those that share the smallest part of what they see with keyframe ``newest`` come first, because they

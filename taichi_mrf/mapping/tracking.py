@@ -34,7 +34,8 @@ from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.momentum import Momentum
 from taichi_mrf.mapping.turning import GYRO_RAD, GyroTurns, turned
-from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera, sees_around
 from taichi_mrf.sensor.frame import Frame
@@ -132,7 +133,7 @@ class Track:
 class Tracker:
     """Follows the camera through one map. It does not add keyframes itself."""
 
-    def __init__(self, m: AligningMap, config: PoseConfig) -> None:
+    def __init__(self, m: MRFMap, config: PoseConfig) -> None:
         self.map = m
         self._config = replace(
             config,

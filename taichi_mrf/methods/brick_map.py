@@ -20,11 +20,13 @@ from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.queries.view import Answer, RayProfile, View
 from taichi_mrf.sensor.camera import Camera, check_camera
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system import runtime, tensors
@@ -146,6 +148,14 @@ class BrickMap(Owned):
         """The world axis that is up in the image of the first keyframe that was added, which may have been
         removed since; None before it."""
         return self._up
+
+    def add(self: OccupancyMap, frame: Frame) -> int:
+        """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. What the frame
+        states of its measurements counts as the configuration says, and its colours if the map has any.
+        Raises what ``add_keyframe`` raises."""
+        color = frame.color if self.METHOD.has_colors else None
+        parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
+        return self.add_keyframe(frame.depth_m, *parts, **frame.own_in(self.config).arguments())
 
     def _stamp(self, stamp_s: Any) -> float:
         """A new keyframe's stamp; the number of keyframes added before if it is None."""

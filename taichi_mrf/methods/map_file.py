@@ -196,8 +196,6 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     cameras = read_cameras(file, n)
     # Earlier versions saved no stamps: without one, the number of a keyframe counts.
     stamps = file.array("keyframe_stamps", "f", (n,)) if "keyframe_stamps" in file else ids.astype(np.float64)
-    if not np.isfinite(stamps).all():
-        raise MapFileError(f"{path}: damaged: a keyframe's stamp is no number")
     keyframes = []
     for i, id in enumerate(ids.tolist()):
         camera = cameras[i]
@@ -205,12 +203,14 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
         color = None
         if f"keyframe_color_{i}" in file:
             color = file.array(f"keyframe_color_{i}", "u", (*camera.shape, 3)).astype(np.uint8)
-        place = as_pose(poses[i]), camera, float(stamps[i])
+        with file.values_of(f"keyframe_T_world_camera of {names[i]}"):
+            T_world_camera = as_pose(poses[i])
+        place = T_world_camera, camera, float(stamps[i])
         own = read_evidence(file, f"keyframe_{i}_", camera)
         keyframes.append(StoredKeyframe(id, names[i], depth_m, *place, color, own))
     next_id = file.integers("next_id", (), 0, 2**53).item()
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
-        raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")
+        raise MapFileError(f"{path}: damaged: keyframe_ids are not valid below next_id, or not distinct")
     config, noise = _config(path, file), read_noise(file)
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
@@ -244,7 +244,7 @@ def _up(path: Path, file: NpzFile, keyframes: list[StoredKeyframe]) -> Up | None
 
 def _config(path: Path, file: NpzFile) -> Config:
     try:
-        return from_dict(Config, parse_yaml(file.scalar("config", "U")), str(path))
+        return from_dict(Config, parse_yaml(file.scalar("config", "U")), f"{path}: config")
     except ValueError as error:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
 
@@ -263,13 +263,14 @@ def noise_arrays(noise: NoiseModel, prefix: str = "") -> dict[str, NDArray[Any]]
 def read_noise(file: NpzFile, prefix: str = "") -> NoiseModel:
     """The noise model that :func:`noise_arrays` has made."""
     prefix = f"{prefix}noise_"
-    if f"{prefix}patch" in file:
-        width, height, *rest = file.array(f"{prefix}camera", "fi", (6,)).tolist()
-        camera = PinholeCamera(int(width), int(height), *rest)
-        sigma, bias = (file.array(prefix + name, "f", (None, None)) for name in ("sigma", "bias"))
-        return PatchNoise(sigma, bias, file.scalar(f"{prefix}patch", "iu"), camera)
-    sigma, bias = (file.array(prefix + name, "f", (1, None))[0] for name in ("sigma", "bias"))
-    return PolynomialNoise(sigma, bias)
+    with file.values_of(f"{prefix}sigma or {prefix}bias"):
+        if f"{prefix}patch" in file:
+            width, height, *rest = file.array(f"{prefix}camera", "fi", (6,)).tolist()
+            camera = PinholeCamera(int(width), int(height), *rest)
+            sigma, bias = (file.array(prefix + name, "f", (None, None)) for name in ("sigma", "bias"))
+            return PatchNoise(sigma, bias, file.scalar(f"{prefix}patch", "iu"), camera)
+        sigma, bias = (file.array(prefix + name, "f", (1, None))[0] for name in ("sigma", "bias"))
+        return PolynomialNoise(sigma, bias)
 
 
 def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
@@ -295,7 +296,8 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
         no_return = file.array(f"{prefix}no_return", "b", camera.shape)
     covariance = None
     if f"{prefix}pose_covariance" in file:
-        covariance = checked_covariance(file.array(f"{prefix}pose_covariance", "f", (6, 6)))
+        with file.values_of(f"{prefix}pose_covariance"):
+            covariance = checked_covariance(file.array(f"{prefix}pose_covariance", "f", (6, 6)))
     return OwnEvidence(noise, sigma_m, no_return, covariance)
 
 
@@ -312,12 +314,15 @@ def camera_arrays(cameras: Sequence[Camera]) -> dict[str, NDArray]:
 
 
 def read_cameras(file: NpzFile, keyframes: int) -> list[Camera]:
-    """The cameras that :func:`camera_arrays` has saved, one for each keyframe. Raises the file's error, and
-    ConfigError for values that are no camera's."""
+    """The cameras that :func:`camera_arrays` has saved, one for each keyframe. Raises the file's error."""
     if NUMBERS not in file:
-        return [_pinhole(row) for row in file.array(_CAMERA_ROWS, "fi", (keyframes, _CAMERA_ROW))]
+        with file.values_of(_CAMERA_ROWS):
+            return [_pinhole(row) for row in file.array(_CAMERA_ROWS, "fi", (keyframes, _CAMERA_ROW))]
     numbers = file.array(NUMBERS, "i", (keyframes,)).tolist()
-    distinct = {number: _read_camera(file, f"camera_{number}_") for number in dict.fromkeys(numbers)}
+    distinct = {}
+    for number in dict.fromkeys(numbers):
+        with file.values_of(f"camera_{number}"):
+            distinct[number] = _read_camera(file, f"camera_{number}_")
     return [distinct[number] for number in numbers]
 
 

@@ -15,6 +15,7 @@ from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
 from taichi_mrf.queries.view import Answer, RayProfile, View
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.voxels.layout import CHUNK, VOXELS
@@ -133,6 +134,10 @@ class OccupancyMap(Protocol):
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
         """The bricks that a keyframe's rays cross, (n, 3). Empty if the method allocates all crossed
         bricks."""
+        ...
+
+    def add(self, frame: Frame) -> int:
+        """Add a frame of a recording as a keyframe; returns its id."""
         ...
 
     def add_keyframe(

@@ -19,11 +19,14 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
-from taichi_mrf.system.npz_file import open_npz, read_npy
+from taichi_mrf.system.later import later
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.model import Sensor
     from taichi_mrf.sensor.polynomials import SensorNoise
+    from taichi_mrf.system import npz_file
+else:
+    (npz_file,) = later("taichi_mrf.system", "npz_file")
 
 
 UNBIASED_STEPS = 5
@@ -129,7 +132,7 @@ class PatchNoise:
         """Read the ``noise.npz`` that ``taichi-mrf calibrate`` writes: ``sigma``, ``bias``, ``patch``, and
         ``camera`` (width, height, fx, fy, cx, cy). Raises ConfigError, which names the file.
         """
-        with open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
+        with npz_file.open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
             width, height, *intrinsics = file.array("camera", "fiu", (6,)).tolist()
             sigma, bias = (file.array(name, "fiu", (None, None)) for name in ("sigma", "bias"))
             patch = file.scalar("patch", "iu")
@@ -280,7 +283,7 @@ def _padded(coefficients: NDArray[np.float64], name: str) -> NDArray[np.float64]
 
 def _load_table(path: str, field: str) -> NDArray[np.float64]:
     try:
-        table = read_npy(Path(path))
+        table = npz_file.read_npy(Path(path))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {said(error)}") from error
     if table.dtype.kind not in "fiu":

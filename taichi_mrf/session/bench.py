@@ -62,9 +62,7 @@ def bench_viewer(
         reader.settled()
         rows = []
         for done, frame in enumerate(frames, start=1):
-            keyframe = m.add_keyframe(
-                frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp
-            )
+            keyframe = m.add(frame)
             m.infer(keyframes=[keyframe], sweeps=1)
             begin = time.perf_counter()
             changes = publisher.changes()

@@ -25,7 +25,8 @@ from taichi_mrf.evaluation.pictures.viewpoint import overview_pose
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.inference.schedule import Progress
-from taichi_mrf.methods.capabilities import MeasuringMap, has_dates, measures_surface, takes_colors
+from taichi_mrf.methods.capabilities import has_dates, measures_surface, takes_colors
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.queries.changed_things import find_changed_things, without_slack
@@ -127,7 +128,7 @@ class ShownSurface:
         return m.view.pool.revision, len(m.keyframes)
 
 
-def _view(surface: DrawnSurface, m: MeasuringMap) -> SurfaceView:
+def _view(surface: DrawnSurface, m: MRFMap) -> SurfaceView:
     """How the picture of a run shows the surface."""
     vertices_m, keyframes = surface.vertices_m, m.keyframes.values()
     up = up_direction(map(upward_axis, keyframes), surface.normals, m.up or Z_UP)

@@ -66,8 +66,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         T_world_camera, chunks = as_pose(frame.T_world_camera), nowhere
         measured = frame.tells_anything(m.sensor)
         if measured:
-            parts = (frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
-            id = m.add_keyframe(*parts, **frame.own_in(m.config).arguments())
+            id = m.add(frame)
             bricks = m.all_crossed_bricks()
             if config.keep_surface:
                 bricks = np.concatenate([bricks, m.measured_bricks()])

@@ -155,9 +155,7 @@ def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
     m = PartialMap.from_config(job.config, dataset.camera)
     id_of = {}
     for index in job.plan.submaps[submap].keyframes:
-        frame = dataset.read(index)
-        parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp)
-        id_of[index] = m.add_keyframe(*parts, color=frame.color, **frame.own_in(m.config).arguments())
+        id_of[index] = m.add(dataset.read(index))
     return m, id_of
 
 

@@ -112,6 +112,16 @@ class NpzFile:
         """One value of one of these kinds."""
         return self.array(name, kinds, ()).item()
 
+    @contextmanager
+    def values_of(self, name: str) -> Iterator[None]:
+        """Errors of this package that the block raises of an array's values name the array and the file."""
+        try:
+            yield
+        except TaichiMRFError as error:
+            if isinstance(error, CapacityError) or str(error).startswith(f"{self._path}: "):
+                raise
+            raise self._problem(name, f"is damaged: {error}") from error
+
     def check_manifest(self) -> None:
         """Raise the file's error if its members differ from those in its manifest."""
         wanted = sorted(self.array(MANIFEST, "U", (None,)).tolist())

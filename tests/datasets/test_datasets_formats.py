@@ -27,6 +27,7 @@ from every_format import WHOLE_NUMBERS
 from rtabmap_database import rvl
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.rtabmap.blobs import decode_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
@@ -146,6 +147,41 @@ def test_tum_drops_depth_without_a_pose_near_enough(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.color, content.color[i])
     # With a gap that reaches the neighbours' poses, those still go to the frames that are closest.
     assert open_dataset(folder, max_time_gap=0.03).dropped == 2
+
+
+def rescaled(path: Path, times: float, head: str = "#") -> None:
+    """Multiply the first number of each line of a list."""
+    lines = [line.split(maxsplit=1) for line in path.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("\n".join([head, *(f"{float(stamp) * times!r} {rest}" for stamp, rest in lines)]))
+
+
+@pytest.mark.parametrize(
+    ("times", "short", "unit"),
+    [(1e3, "ms", "milliseconds"), (1e6, "us", "microseconds"), (1e9, "ns", "nanoseconds")],
+)
+@pytest.mark.parametrize("first_s", [0.0, 99.5])
+def test_stamps_in_another_unit_than_the_images_are_named_with_the_remedy(
+    tmp_path: Path, times: float, short: str, unit: str, first_s: float
+) -> None:
+    """Clocks that start at 0: the stamps' size does not tell the unit, and some go beyond those of 1973."""
+    folder = write_tum(tmp_path, Content(24), first_s)
+    poses = folder / "groundtruth.txt"
+    (tmp_path / "poses.txt").write_text(poses.read_text())
+    rescaled(poses, times)
+    named = rf"stamps of the poses are {times:.0f} times those of the depth images .* as {unit} are"
+    with pytest.raises(DatasetError, match=rf"{named} .*'# stamp_{short} tx ty tz qx qy qz qw'"):
+        open_dataset(folder)
+    rescaled(poses, 1.0, f"# stamp_{short} tx ty tz qx qy qz qw")
+    assert len(open_dataset(folder)) == 24
+    rescaled(tmp_path / "poses.txt", times)
+    with pytest.raises(DatasetError, match=r"stamps of the poses are .* those of the frames"):
+        open_posed(folder, tmp_path / "poses.txt")
+    rescaled(poses, 1 / times)
+    rescaled(folder / "depth.txt", times)
+    with pytest.raises(
+        DatasetError, match=rf"those of the poses .*divide those of the depth images by {times:.0f}"
+    ):
+        open_dataset(folder)
 
 
 def test_tum_without_colour_and_unsorted(tmp_path: Path) -> None:

@@ -222,3 +222,20 @@ def test_floats_in_millimetres_are_refused_unless_the_scale_is_given(
         refused(tmp_path / "a.npz", "hardly metres: --depth-scale 1000", intrinsics=(14.0, 14.0, 7.5, 5.5))
     else:
         check(open_dataset(tmp_path / "a.npz", depth_scale=scale, intrinsics=(14.0, 14.0, 7.5, 5.5)), scale)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("out/map.npz", "map.npz: is a saved map, not a recording: .* live, .* read map.npz"),
+        ("out", "out: is a saved map, not a recording: .* live, .* read map.npz"),
+        ("room.zarr", "room.zarr: is a saved map, .* info, export and diff read it"),
+    ],
+)
+def test_a_saved_map_is_no_recording(tmp_path: Path, name: str, words: str) -> None:
+    for folder in ("out", "room.zarr"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "room.zarr/zarr.json").write_text("{}")
+    np.savez(tmp_path / "out/map.npz", format=np.array(2), keyframe_ids=np.zeros(0, int))
+    with pytest.raises(DatasetError, match=words):
+        open_dataset(tmp_path / name)

@@ -1,17 +1,19 @@
 """Sources of poses: the files that they are read from, files that change, and which pose is whose."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import stamped_line, write_log, write_rows
+from datasets_recordings import Content, stamped_line, write_log, write_numbered, write_rows, write_tum
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from inputs_bags import START, Bag, writing
 from scipy.spatial.transform import Rotation
 from sliding_camera import CAMERA, sequence
 
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
 from taichi_mrf.datasets.pose_sources.graph_file import PoseGraph, read_pose_graph, write_pose_graph
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
@@ -302,3 +304,23 @@ def _fill(bag: Bag) -> None:
     bag.camera_info("/camera_info", "optical", CAMERA)
     for i in range(4):
         bag.image("/depth", 0.1 * i, "optical", np.full(CAMERA.shape, 1000, np.uint16), "16UC1")
+
+
+@pytest.mark.parametrize("write", [write_tum, write_numbered])
+def test_folders_without_poses_are_tracked_or_take_those_of_a_file(
+    tmp_path: Path, write: Callable[[Path, Content], Path]
+) -> None:
+    content = Content(4)
+    folder = write(tmp_path / "mine", content)
+    (folder / "groundtruth.txt").unlink(missing_ok=True)
+    with pytest.raises(DatasetError, match=r"--poses FILE takes them .*, --track-poses finds them"):
+        open_dataset(folder)
+    tracked = open_dataset(folder, track=True)
+    assert tracked.tracked
+    assert len(tracked) == 4
+    stamps = tracked.stamps()
+    lines = [stamped_line(float(s), T) for s, T in zip(stamps, content.poses, strict=True)]
+    (tmp_path / "slam.txt").write_text("\n".join(lines))
+    posed = open_posed(folder, tmp_path / "slam.txt")
+    for i, T in enumerate(content.poses):
+        np.testing.assert_allclose(posed.pose(i), T, atol=1e-9)

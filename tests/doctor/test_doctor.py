@@ -16,9 +16,10 @@ from stereo_rig import write_kitti
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes_at_a_glance
+from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes, mistakes_at_a_glance
 from taichi_mrf.doctor.picture import overlap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
@@ -129,14 +130,31 @@ def test_a_camera_that_turns_in_place_does_not_tell_the_unit(room: list[Frame]) 
     assert {"the unit of depth", "the direction of poses", "the time of poses"} <= set(still.undecided)
 
 
+def in_millimetres(frames: Sequence[Frame]) -> list[Frame]:
+    return of_poses(lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [np.eye(4)[3:]]]))(frames)
+
+
 def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
     same = [replace(frame, T_world_camera=room[0].T_world_camera) for frame in room]
     (finding,) = diagnose(of_frames(same)).findings
     assert "all the same" in finding.text
     assert "--poses FILE" in finding.text
-    in_mm = of_poses(lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [np.eye(4)[3:]]]))(room)
-    (finding,) = diagnose(of_frames(in_mm)).findings
+    (finding,) = diagnose(of_frames(in_millimetres(room))).findings
     assert finding.text == "poses are in millimetres: divide their positions by 1000"
+    both = [replace(f, depth_m=np.rint(1000 * f.depth_m) / np.float32(5000)) for f in in_millimetres(room)]
+    (finding,) = diagnose(of_frames(both)).findings
+    assert finding.text.startswith("poses and depths are in one unit, and that is not metres")
+    assert finding.flag == "--depth-scale 1000"
+
+
+def test_a_sensor_that_moves_farther_than_it_sees_is_a_note(room: list[Frame], tmp_path: Path) -> None:
+    """Also where frames are too few for a reading that explains them."""
+    for name, frames in (("right", room), ("wrong", in_millimetres(room))):
+        folder = write_tum(tmp_path / name, frames[::8])
+        notes = " ".join(open_dataset(folder, depth_scale=1000).notes)
+        assert ("farther than it sees" in notes and "such as millimetres" in notes) == (name == "wrong")
+        found = diagnose(open_dataset(folder, depth_scale=1000)).findings
+        assert any("millimetres" in finding.text for finding in found) == (name == "wrong")
 
 
 def test_a_short_recording_of_quick_turns_is_understood(room: list[Frame]) -> None:
@@ -225,6 +243,18 @@ def test_map_names_the_mistake_and_learns_no_noise_from_it(
     assert note.endswith("poses are T_camera_world (--poses-are inverse mends it).")
     assert report["noise"]["learnt"] is None
     assert "--noise auto" not in " ".join(report["notes"])
+
+
+@pytest.mark.parametrize(("wrong", "depth_is"), [("inverse,opengl", "axial"), ("ros", "range")])
+def test_map_says_the_words_of_a_pose_file_as_they_ought_to_be_written(
+    room: list[Frame], wrong: str, depth_is: str, tmp_path: Path
+) -> None:
+    frames = broken(room, "opengl", *(["range"] if depth_is == "range" else []))
+    folder, lines = write_tum(tmp_path / "mine", frames), tmp_path / "poses.txt"
+    lines.write_text((folder / "groundtruth.txt").read_text())
+    said = {"depth_scale": 1000, "depth_is": depth_is, "color": False}
+    (mistake,) = mistakes(open_posed(folder, lines, poses_are=wrong, **said))
+    assert mistake.endswith("(--poses-are opengl mends it)")
 
 
 def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp_path: Path) -> None:

@@ -73,6 +73,27 @@ def test_each_array_is_refused_or_read_without_harm(arrays: dict[str, np.ndarray
     assert places <= refused <= arrays.keys()
 
 
+@pytest.mark.parametrize(
+    ("name", "number", "words"),
+    [
+        (
+            "keyframe_T_world_camera",
+            -1.0,
+            "keyframe_T_world_camera of frame 1 is damaged: the last row of a pose",
+        ),
+        ("keyframe_cameras", 0.0, "keyframe_cameras is damaged: camera width must be at least 1, not 0"),
+        ("keyframe_ids", 7, "damaged: keyframe_ids are not valid below next_id, or not distinct"),
+    ],
+)
+def test_values_that_cannot_be_are_refused_by_the_arrays_name(
+    name: str, number: float, words: str, arrays: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    wrong = np.full_like(arrays[name], number)
+    write_npz(tmp_path / "map.npz", {**arrays, name: wrong}, manifest=True)
+    with pytest.raises(MapFileError, match=rf"map\.npz: {words}"):
+        MRFMap.load(tmp_path / "map.npz")
+
+
 @pytest.mark.parametrize("name", ["frozen_crossed", "bricks", "frozen_owners", "frozen_ids"])
 def test_the_error_names_the_array_and_the_number(
     name: str, arrays: dict[str, np.ndarray], tmp_path: Path

@@ -33,7 +33,14 @@ from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
+from taichi_mrf.datasets.trajectories import (
+    OTHERWISE,
+    RecordedPose,
+    Trajectory,
+    is_trajectory,
+    poses_at_start,
+    read_trajectory,
+)
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -50,7 +57,8 @@ _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
     images = numbered_images(folder)
-    trajectory = _find_trajectory(folder, list(images.values()))
+    found = _find_trajectory(folder, list(images.values()), options.track)
+    trajectory = found or poses_at_start(folder, "rows", images)
     gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
     poses, notes = _poses_by_number(list(images), trajectory, gap)
     left_handed = trajectory.path.suffix == ".freiburg"
@@ -60,8 +68,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     if lost:
         notes.append(f"{len(lost)} of {len(images)} images dropped: tracking was lost")
     posed = [number for number in images if number in poses and number not in lost]
-    found = [poses[number] for number in posed]
-    own = own_cameras([None if pose is None else pose.camera for pose in found], options)
+    of_images = [poses[number] for number in posed]
+    own = own_cameras([None if pose is None else pose.camera for pose in of_images], options)
     frames = [
         _frame(folder, number, images[number], trajectory, poses[number], left_handed) for number in posed
     ]
@@ -89,8 +97,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     )
 
 
-def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
-    """The only trajectory of a recording."""
+def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Trajectory | None:
+    """The only trajectory of a recording; None if it ``may_lack`` one, and does."""
     suffixes = (".txt", ".log", ".freiburg")
     candidates = [
         path
@@ -98,13 +106,16 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
         if (path.suffix in suffixes and path.name not in CAMERA_FILES and is_trajectory(path))
         or (path.suffix == ".json" and is_trajectory_json(path))
     ]
+    if not candidates and may_lack and any(map(holds_depth, images[:2])):
+        return None
     if len(candidates) != 1 and (hint := pose_files_hint(folder, images)):
         raise DatasetError(f"{folder}: {hint}")
     if not candidates and not any(map(holds_depth, images[:2])):
         raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
         raise DatasetError(
-            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}"
+            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}; "
+            f"{OTHERWISE}"
         )
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)

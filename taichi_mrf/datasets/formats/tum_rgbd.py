@@ -18,10 +18,16 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import in_seconds
+from taichi_mrf.datasets.pose_text import stamps_a_second
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.timed_poses import apart_in_words
-from taichi_mrf.datasets.trajectories import RecordedPose, is_trajectory, read_trajectory
+from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
+from taichi_mrf.datasets.trajectories import (
+    OTHERWISE,
+    RecordedPose,
+    is_trajectory,
+    poses_at_start,
+    read_trajectory,
+)
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import is_file, read_text
@@ -45,12 +51,13 @@ CAMERAS = {
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the depth images that have a pose within the largest gap, by their stamps."""
     depth = _read_list(folder / DEPTH_LIST) if is_file(folder / DEPTH_LIST) else stamped_images(folder)
-    poses = _poses(folder)
-    trajectory = read_trajectory(poses)
+    poses = _poses(folder, options.track)
+    stamps = [stamp for stamp, _ in depth]
+    unposed = options.track and not is_file(poses)
+    trajectory = poses_at_start(poses, "stamped", stamps) if unposed else read_trajectory(poses)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{trajectory.path}: expected lines of stamp tx ty tz qx qy qz qw")
     gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
-    stamps = [stamp for stamp, _ in depth]
     known = [pose for pose in trajectory.poses if not pose.is_lost]
     partners = associate(stamps, [pose.key for pose in known], gap)
     matched = [
@@ -58,6 +65,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         for (stamp, path), partner in zip(depth, partners, strict=True)
         if partner is not None
     ]
+    if 2 * len(matched) < len(depth):
+        check_unit(stamps, [pose.key for pose in known], "depth images", str(folder), poses.name)
     if not matched:
         first, last = trajectory.poses[0].key, trajectory.poses[-1].key
         raise DatasetError(
@@ -87,14 +96,16 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     )
 
 
-def _poses(folder: Path) -> Path:
+def _poses(folder: Path, may_lack: bool) -> Path:
     """The file of poses, or the only other one in the folder, as SLAM programs call theirs otherwise. Raises
-    DatasetError if there is none."""
+    DatasetError if there is none and it ``may_lack`` none."""
     others = [] if is_file(folder / POSES) else [p for p in folder.glob("*.txt") if is_trajectory(p)]
-    if is_file(folder / POSES) or len(others) == 1:
+    if is_file(folder / POSES) or len(others) == 1 or (may_lack and not others):
         return others[0] if others else folder / POSES
     names = ", ".join(path.name for path in others) or "no other file of poses is there"
-    raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses ({names})")
+    raise DatasetError(
+        f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses ({names}); {OTHERWISE}"
+    )
 
 
 def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
@@ -171,10 +182,11 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         longest = max((len(os.fsencode(part)) for part in file.parts), default=0)
         if longest > LONGEST_NAME:
             raise DatasetError(f"{path} line {number}: no file has a name of {longest} bytes")
-        entries.append((in_seconds(stamp), file))
+        entries.append((stamp, file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")
-    return sorted(entries)
+    rate = stamps_a_second([stamp for stamp, _ in entries])
+    return sorted((stamp / rate, file) for stamp, file in entries)
 
 
 def _beside(folder: Path, name: str) -> Path:

@@ -49,6 +49,7 @@ class FramePoses:
         self._by_own_number = {n: name for name in frame_names if (n := number_in(name)) is not None}
         self._poses: dict[str, Pose] = {}
         self._timed = TimedPoses([], [])
+        self._taken: ChangedPoses = {}
         self.changes = 0
         """How often poses were taken in."""
         self.unknown: list[str] = []
@@ -57,6 +58,11 @@ class FramePoses:
     def __len__(self) -> int:
         """How many poses the source has."""
         return len(self._poses) + len(self._timed)
+
+    @property
+    def stamps(self) -> NDArray[np.float64]:
+        """The stamps of the poses that have some, seconds."""
+        return self._timed.stamps
 
     @property
     def warning(self) -> str | None:
@@ -76,8 +82,15 @@ class FramePoses:
             self.take(changed)
         return changed is not None
 
+    def as_written(self, frame_names: Sequence[str]) -> "FramePoses":
+        """The same poses, without their conventions undone."""
+        written = FramePoses(self.source, frame_names, self._gap_s)
+        written.take(self._taken)
+        return written
+
     def take(self, changed: ChangedPoses) -> None:
         """Take in all poses of the source. Raises DatasetError for a pose that is no rigid transform."""
+        self._taken = changed
         named: dict[str, Pose] = {}
         numbered: dict[int, Pose] = {}
         stamps: list[float] = []

@@ -17,6 +17,7 @@ from taichi_mrf.datasets.pose_sources.base import PoseSource
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.registry import open_dataset
+from taichi_mrf.datasets.timed_poses import check_unit
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.frame import Frame
@@ -133,6 +134,8 @@ def posed_by(
     if not follow:
         stamps = dataset.stamps()
         posed = [i for i, name in enumerate(names) if poses.of(name, float(stamps[i])) is not None]
+        if 2 * len(posed) < len(names):
+            check_unit(stamps, poses.stamps, "frames", dataset.name, source.name)
         if not posed:
             raise DatasetError(
                 f"{source.name}: has a pose for none of the {len(names)} frames of {dataset.name}"

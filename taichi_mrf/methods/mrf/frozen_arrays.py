@@ -56,7 +56,7 @@ def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> Co
     )
     known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
     if not known or (share.bw <= 0).any():
-        raise MapFileError(f"{path}: damaged: the colours of frozen keyframes are not those of its voxels")
+        raise MapFileError(f"{path}: damaged: frozen_color_bricks or frozen_color_bw are not of its voxels")
     return share
 
 
@@ -80,5 +80,5 @@ def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
     bricks = read_places(path, file, f"frozen_{name}_bricks")
     sums = file.integers(f"frozen_{name}_sums", (len(bricks), VOXELS, values), -LARGEST, LARGEST)
     if (values == VALUES and (sums[..., 0] < 0).any()) or (np.diff(grid_keys(bricks)) <= 0).any():
-        raise MapFileError(f"{path}: damaged: what frozen keyframes measured is not in order")
+        raise MapFileError(f"{path}: damaged: frozen_{name}_bricks or _sums are not in order")
     return BrickSums(bricks, sums.astype(np.int32))
