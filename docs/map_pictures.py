@@ -19,10 +19,9 @@ from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction,
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.queries.box import map_extent
+from taichi_mrf.queries.box import map_extent, slice_map
 from taichi_mrf.queries.distance import DistanceField
 from taichi_mrf.queries.frontiers import find_frontiers
-from taichi_mrf.queries.slices import slice_map
 from taichi_mrf.sensor.camera import PinholeCamera
 
 if TYPE_CHECKING:

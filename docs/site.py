@@ -14,9 +14,9 @@ from api_page import api_page
 from floor_plan import floor_plan
 from mkdocs.structure.files import File, Files
 
-from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import field_help
+from taichi_mrf.config.values import is_in_files
 from taichi_mrf.factor_graph.config import LaserConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from taichi_mrf.methods.visibility.map import VisibilityMap as VisibilityMap
     from taichi_mrf.methods.wavemap.map import WavemapMap as WavemapMap
     from taichi_mrf.queries.box import read_box as read_box
+    from taichi_mrf.queries.box import slice_map as slice_map
     from taichi_mrf.queries.cast import cast_rays as cast_rays
     from taichi_mrf.queries.change import compare_maps as compare_maps
     from taichi_mrf.queries.distance import DistanceField as DistanceField
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from taichi_mrf.queries.points import FREE as FREE
     from taichi_mrf.queries.points import OCCUPIED as OCCUPIED
     from taichi_mrf.queries.points import UNKNOWN as UNKNOWN
-    from taichi_mrf.queries.slices import slice_map as slice_map
     from taichi_mrf.sensor.camera import PinholeCamera as PinholeCamera
     from taichi_mrf.sensor.distortion import DistortedCamera as DistortedCamera
     from taichi_mrf.sensor.frame import Frame as Frame
@@ -69,7 +69,7 @@ _PUBLIC = {
     "FREE": "taichi_mrf.queries.points",
     "OCCUPIED": "taichi_mrf.queries.points",
     "read_box": "taichi_mrf.queries.box",
-    "slice_map": "taichi_mrf.queries.slices",
+    "slice_map": "taichi_mrf.queries.box",
     "cast_rays": "taichi_mrf.queries.cast",
     "DistanceField": "taichi_mrf.queries.distance",
     "find_frontiers": "taichi_mrf.queries.frontiers",

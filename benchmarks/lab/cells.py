@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.lab.cell_truth import NOT_JUDGED, OCCUPIED, SeenSpace, occupied_bricks, true_cells
 from taichi_mrf import MRFMap, open_dataset
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, reliability_bins, score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth

@@ -7,7 +7,7 @@ ranges are, and how much of their evidence counts.
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
-from taichi_mrf.config.baselines import WavemapConfig
+from taichi_mrf.config.sections import WavemapConfig
 from taichi_mrf.experiments.contenders import Contender, wavemap
 
 TUNED = "wavemap-style, tuned"

@@ -22,19 +22,16 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.shared.terminal import PROGRAM
-from taichi_mrf.config import inference, time
 from taichi_mrf.config import schema as config
-from taichi_mrf.config.gone import note_gone
-from taichi_mrf.config.places import has_flag, is_in_files
+from taichi_mrf.config import sections
 from taichi_mrf.config.text import field_help
-from taichi_mrf.config.values import nearest
+from taichi_mrf.config.values import has_flag, is_in_files, nearest, note_gone
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph import config as factor_graph_config
 
 DEFINITIONS = (
     config.__name__,
-    inference.__name__,
-    time.__name__,
+    sections.__name__,
     calibration_options.__name__,
     factor_graph_config.__name__,
 )

@@ -2,7 +2,7 @@
 
 YAML files, the command line and the sliders are made from these dataclasses: a field's docstring is its
 help text, its default is the default, and its range is checked here. Where a field can be set besides Python,
-places.py says. Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at
+values.py says. Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at
 once.
 """
 
@@ -15,13 +15,24 @@ from typing import Any, Literal
 import yaml
 
 from taichi_mrf.config.arguments import real
-from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig, WavemapConfig
 from taichi_mrf.config.files import find_config, read_yaml
-from taichi_mrf.config.inference import InferenceConfig
-from taichi_mrf.config.places import IN_FILES, IN_PYTHON, in_files, in_python
 from taichi_mrf.config.registry import METHODS, MethodName, methods_with
-from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.config.values import as_files_set_it, check_field, from_dict
+from taichi_mrf.config.sections import (
+    InferenceConfig,
+    LogOddsConfig,
+    TimeConfig,
+    VisibilityConfig,
+    WavemapConfig,
+)
+from taichi_mrf.config.values import (
+    IN_FILES,
+    IN_PYTHON,
+    as_files_set_it,
+    check_field,
+    from_dict,
+    in_files,
+    in_python,
+)
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from taichi_mrf.config.places import is_in_files
+from taichi_mrf.config.values import is_in_files
 
 _WIDTH = 100
 

@@ -1,4 +1,5 @@
-"""Typed dataclasses from plain values, which come from YAML or from a caller.
+"""Values of parameters: the places where each can be set, those of earlier versions, and typed dataclasses
+made from the plain values of YAML or of a caller.
 
 A dataclass is the only definition of its parameters' names and types. A value that does not fit raises a
 ConfigError, which names the place and, for an unknown name, the nearest known one.
@@ -12,13 +13,84 @@ import types
 import typing
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
-from taichi_mrf.config.gone import note_gone
-from taichi_mrf.config.places import is_in_files
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 
 T = TypeVar("T")
+
+IN_FILES, IN_PYTHON = {"flag": False}, {"flag": False, "file": False}
+"""The metadata of such fields."""
+
+
+def in_files(default: T) -> T:
+    """A field that has no flag: a file sets it (--config)."""
+    return cast(T, dataclasses.field(default=default, metadata=IN_FILES))
+
+
+def in_python(default: T) -> T:
+    """A field that only Python sets. Map files hold it too."""
+    return cast(T, dataclasses.field(default=default, metadata=IN_PYTHON))
+
+
+def has_flag(field: "dataclasses.Field[Any]") -> bool:
+    """True if a command has a flag for a field, or flags for its fields."""
+    return bool(field.metadata.get("flag", True))
+
+
+def is_in_files(field: "dataclasses.Field[Any]") -> bool:
+    """True if a file of parameters may set a field."""
+    return bool(field.metadata.get("file", True))
+
+
+_ALWAYS = "all maps have {}, the best that was measured"
+
+GONE: dict[str, dict[str, tuple[Any, str]]] = {
+    "InferenceConfig": {
+        "method": ("sum-product", "MRFMap computes marginals; factor_graph() and laser have max-product"),
+        "tolerance": (0.0, "MRFMap.infer takes it as an argument"),
+        "damping": (0.0, "messages are not damped"),
+        "likelihood": ("auto", "the likelihood is averaged over a segment where sigma is less than a voxel"),
+        "tail_share": (0.0, "errors are normal; outlier_floor allows for others"),
+        "tail_sigmas": (10.0, "errors are normal; outlier_floor allows for others"),
+        "end_sigmas": (3.0, "a ray ends 3 sigma behind its measurement"),
+        "segment_lengths": (True, "a voxel counts by the length of the ray in it"),
+        "plane_window": (0.0, "predicted depth and the surface are finer than voxels without it"),
+        "ray_choice": ("bundle", "pixels that agree share a ray"),
+        "first_sweep_stride": (1, "every ray is followed; ray_density sets how many there are"),
+        "free_space_stride": (1, "every ray is followed; ray_density sets how many there are"),
+        "average": ("log_odds", "log-odds are averaged"),
+        "ray_correlation": (1.0, "a keyframe counts once, as in the paper"),
+        "min_length": (0.02, _ALWAYS.format("0.02")),
+        "message_clamp": (6.9, _ALWAYS.format("6.9")),
+        "cavity_clamp": (9.2, _ALWAYS.format("9.2")),
+        "doubt_free": (0.01, _ALWAYS.format("0.01")),
+        "doubt_occupied": (0.01, _ALWAYS.format("0.01")),
+        "return_pass": ("replay", "rays are replayed from a trace"),
+        "message_precision": ("float16", _ALWAYS.format("float16")),
+    },
+    "KeyframeConfig": {"against": ("last", "a frame is compared with the last keyframe, as in the paper")},
+    "PoseConfig": {
+        "rounds": (2, "keyframes are aligned with each other in at most 2 rounds"),
+        "use_color": (True, "a camera is tracked by its colour images too, where it has any"),
+        "carry_unnamed": (True, "frames without a pose move with the last one before them that has one"),
+        "follow_budget_s": (0.2, "keyframes follow a file for about 0.2 s between two frames"),
+        "follow_quiet_s": (10.0, "poses that follow a file are final after 10 s without a change"),
+    },
+    "RuntimeConfig": {"debug": (False, "taichi_mrf.init takes it as an argument")},
+}
+"""By the name of the dataclass that had it: a parameter's default, which needs no warning, and what became of
+it."""
+
+
+def note_gone(section: str, key: str, value: object) -> str | None:
+    """Note on a removed parameter: "" if its value was the default; None if none ever had this name."""
+    known = GONE.get(section, {}).get(key)
+    if known is None:
+        return None
+    default, became = known
+    return "" if value == default else f"{key} is no longer a parameter: {became}"
+
 
 _LARGEST_INTEGER = 2**63 - 1
 
@@ -96,7 +168,7 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
 
 
 def as_files_set_it(config: Any, where: str, in_files: bool = True) -> Any:
-    """A dataclass read from a file without what only Python sets (places.py). Warns of each value that
+    """A dataclass read from a file without what only Python sets (values.py). Warns of each value that
     differs from its default, because files of earlier versions set it."""
     kept = {}
     for field in dataclasses.fields(config):

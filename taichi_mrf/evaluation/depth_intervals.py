@@ -20,8 +20,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
-from taichi_mrf.queries.occlusion import Occlusion, occlusion, stopped_share
-from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.queries.survey import OPAQUE, Occlusion, occlusion, stopped_share
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail

@@ -33,13 +33,13 @@ from taichi_mrf.voxels.marks import (
     blocks,
     count,
     mark,
+    mark_triangles,
     marked_voxels,
     no_marks,
     voxel_in_window,
 )
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels, within
-from taichi_mrf.voxels.triangles import mark_triangles
 from taichi_mrf.voxels.window import Window
 
 SLACK = 0.01

@@ -16,7 +16,7 @@ from taichi_mrf.experiments.contenders import Contender, log_odds, mrf
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene
-from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import RayProfile
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

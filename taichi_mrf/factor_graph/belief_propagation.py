@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.factor_graph.graph import BeamWorkers, FactorGraph, beam_workers
 from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph
-from taichi_mrf.factor_graph.workers import BeamWorkers, beam_workers
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template

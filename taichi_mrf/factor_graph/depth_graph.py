@@ -19,12 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.beams import BrickCells
-from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity
-from taichi_mrf.factor_graph.kernels import count_degrees
+from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity, count_degrees
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.inference.sum_product import TINY

@@ -1,9 +1,10 @@
-"""The factor graph of all beams (section III-C): which cells each beam crosses, and which beams cross a cell.
+"""The factor graph of all beams (section III-C), and the workers that share them: cells that each beam
+crosses, and beams that cross each cell.
 
 Two compressed lists. That of a beam holds its cells in their order from the origin; it is found with the
-traversal that all rays use, in a pass that counts and one that writes. That of a cell holds its beams, and
-at which step each of them comes through; only some methods need it, so it is made when it is first used. A
-beam is the factor of its number; an edge is a place in the beams' list.
+traversal that all rays use, in a pass that counts and one that writes. That of a cell holds its beams, and at
+which step each of them comes through; only some methods need it, so it is made when it is first used. A beam
+is the factor of its number; an edge is a place in the beams' list.
 """
 
 from dataclasses import dataclass
@@ -14,11 +15,99 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
-from taichi_mrf.factor_graph.kernels import count_cells, count_degrees, write_beams_of_cells, write_cells
 from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import AnyArray, I32Array
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import available_bytes
+from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, within
+
+
+@ti.dataclass
+class _Cursor(Struct):
+    """Where a beam's next cell is written."""
+
+    next: ti.i32
+
+
+@ti.func
+def walk_cells(
+    rays: Template, beam: ti.i32, shape: IVec3, visit: Template, state: Template, context: Template
+):
+    """Call ``visit(state, context, cell)`` with the number of each cell that a beam crosses, in order."""
+    ray = make_ray(
+        Vec3(rays[beam, 0], rays[beam, 1], rays[beam, 2]), Vec3(rays[beam, 3], rays[beam, 4], rays[beam, 5])
+    )
+    end: F32 = rays[beam, 6]
+    t = 0.0
+    walk = enter(ray, t, 1, IVec3(0), shape)
+    while t < end and within(walk.cell, shape):
+        leave = leave_at(walk)
+        t_leave = ti.min(leave, end)
+        if t_leave > t:  # a ray through an edge touches cells for no length at all
+            visit(state, context, flat(walk.cell, shape))
+            t = t_leave
+        advance(ray, walk, leave, 1)
+
+
+@ti.func
+def _count(state: Template, context: Template, cell: ti.i32):
+    """One cell of a beam whose cells are counted."""
+    state.next += 1
+
+
+@ti.func
+def _write(state: Template, context: Template, cell: ti.i32):
+    """One cell of a beam."""
+    context[state.next] = cell
+    state.next += 1
+
+
+@ti.kernel
+def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
+    """How many cells each beam crosses, into ``counts`` (beams).
+
+    ``rays`` is (beams, 7): origin, direction and range in cell sizes from the corner of a grid of ``shape``
+    cells.
+    """
+    for beam in range(counts.shape[0]):
+        place = _Cursor(0)
+        walk_cells(rays, beam, shape, _count, place, counts)
+        counts[beam] = place.next
+
+
+@ti.kernel
+def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array):
+    """Which cells each beam crosses, into ``cells`` (edges) from ``begins`` (beams + 1) on; ``rays`` as
+    above."""
+    for beam in range(begins.shape[0] - 1):
+        place = _Cursor(begins[beam])
+        walk_cells(rays, beam, shape, _write, place, cells)
+
+
+@ti.kernel
+def count_degrees(cells: I32Array, edges: ti.i32, degrees: I32Array):
+    """How many beams cross each cell: ``cells`` (edges) counted into ``degrees`` (cells)."""
+    for edge in range(edges):
+        ti.atomic_add(degrees[cells[edge]], 1)
+
+
+@ti.kernel
+def write_beams_of_cells(
+    begins: I32Array, cells: I32Array, places: I32Array, beams: I32Array, steps: AnyArray
+):
+    """Each cell's ``beams`` and their ``steps`` (edges); ``places`` (cells) is where each cell's list begins,
+    and is used up. ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph.
+
+    The order within a cell's list depends on the threads: sums over it must not depend on it.
+    """
+    for beam in range(begins.shape[0] - 1):
+        for edge in range(begins[beam], begins[beam + 1]):
+            place = ti.atomic_add(places[cells[edge]], 1)
+            beams[place] = beam
+            steps[place] = ti.cast(edge - begins[beam], ti.i16)
+
 
 EDGE_BYTES = 4 + 6 + 4
 """A cell's number; a beam's number and step in the cell's list; a message."""
@@ -167,3 +256,34 @@ def _array(values: NDArray) -> ti.Ndarray:
     array = ti.ndarray(ti.i32 if values.dtype == np.int32 else ti.f32, values.shape)
     array.from_numpy(values)
     return array
+
+
+SCRATCH_BYTES = 256 << 20
+"""Most scratch on a GPU, of two values for each step of a worker's present beam."""
+
+
+@dataclass(frozen=True)
+class BeamWorkers(Bundle):
+    """Workers that take a part of all beams each."""
+
+    number: I32
+
+    spread: I32
+    """Iterations of the parallel loop that a worker stands for."""
+
+    longest: I32
+    """Steps of the longest beam: a worker's part of the scratch."""
+
+    @ti.func
+    def begin(self, worker: I32, first: I32, end: I32):
+        """Start of a worker's part of first .. end; it ends where the next worker's starts."""
+        return first + ti.cast(ti.cast(end - first, ti.i64) * worker // self.number, ti.i32)
+
+
+def beam_workers(graph: FactorGraph) -> BeamWorkers:
+    """Workers for the backend that runs."""
+    if runtime.active() == "cpu":
+        # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
+        return BeamWorkers(64, 512, graph.longest)
+    most = SCRATCH_BYTES // (8 * graph.longest)
+    return BeamWorkers(max(256, min(65536, most, graph.beams)), 1, graph.longest)

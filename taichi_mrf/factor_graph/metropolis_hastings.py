@@ -1,12 +1,20 @@
-"""Metropolis-Hastings over the labels of cells (section IV, Alg. 1), with and without a heat map.
+"""Sampling of labels by Metropolis-Hastings, the flips that it makes, and the inverse sensor model that its
+heat map follows.
 
-A proposal flips one cell and is accepted with the ratio of the probabilities, for which only the beams that
-cross the cell are looked at (eq. 16; flips.py).
+A flip of one cell is judged (eq. 16) by the beams that cross it alone. For a labelling, the first occupied
+step of every beam is kept, which is all that its energy depends on. A flip before it or at it changes a
+beam's energy, and only freeing the first one itself makes it look further along the beam. Several labellings
+may be kept at once, one behind the other: a labelling's cells begin at ``base`` and its beams at
+``beam_base``.
+
+Metropolis-Hastings (section IV, Alg. 1) runs with and without a heat map. A proposal flips one cell and is
+accepted with the ratio of the probabilities, for which only the beams that cross the cell are looked at (eq.
+16).
 
 Parallel are independent chains, each of which is the sequential algorithm as it stands: detailed balance
-holds for every one of them, and their marginals may be averaged. Cells are drawn with fixed weights, which
-do not depend on the labels, so the heat map's proposals are as symmetric as eq. 15's. Random numbers depend
-on a seed, a stream and a counter alone, whichever thread asks for them.
+holds for every one of them, and their marginals may be averaged. Cells are drawn with fixed weights, which do
+not depend on the labels, so the heat map's proposals are as symmetric as eq. 15's. Random numbers depend on a
+seed, a stream and a counter alone, whichever thread asks for them.
 """
 
 from dataclasses import dataclass
@@ -15,13 +23,125 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
 from taichi_mrf.factor_graph.graph import CellLists, FactorGraph
-from taichi_mrf.factor_graph.inverse import ends_of_beams, inverse_model
-from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph
+from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph, to_units
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
 from taichi_mrf.system.compiler import ti
+
+
+@ti.kernel
+def _count_ends(begins: I32Array, cells: I32Array, hits: I32Array, ends: I32Array):
+    """Count into ``ends`` (cells) the beams with a return that end in each cell.
+
+    ``begins`` (beams + 1), ``cells`` (edges) and ``hits`` (beams) are those of the graph.
+    """
+    for f in range(begins.shape[0] - 1):
+        if hits[f] == 1 and begins[f + 1] > begins[f]:
+            ti.atomic_add(ends[cells[begins[f + 1] - 1]], 1)
+
+
+@dataclass(frozen=True)
+class InverseModel:
+    """Labels and marginals, (cells,): what no beam crosses is free, at one half."""
+
+    labels: NDArray[np.uint8]
+    marginals: NDArray[np.float32]
+
+
+def ends_of_beams(graph: FactorGraph) -> NDArray[np.int32]:
+    """(cells,): how many beams with a return end in each cell."""
+    ends = np.zeros(graph.grid.cells, np.int32)
+    if graph.beams:
+        _count_ends(graph.begins, graph.cells, graph.hits, ends)
+    return ends
+
+
+def inverse_model(graph: FactorGraph, log_odds: float) -> InverseModel:
+    """A return makes its own cell more occupied by ``log_odds``, and each cell before it more free."""
+    returns = ends_of_beams(graph)
+    votes = 2 * returns.astype(np.int64) - graph.degrees.to_numpy()
+    marginals = 1.0 / (1.0 + np.exp(np.clip(-log_odds * votes, -700, 700)))
+    return InverseModel((votes > 0).astype(np.uint8), marginals.astype(np.float32))
+
+
+SPREAD = 512
+"""Taichi gives a CPU thread no fewer iterations of a loop at a time: one long task stands for that many."""
+
+
+@ti.kernel
+def find_firsts(
+    begins: I32Array, cells: I32Array, labels: I32Array, firsts: I32Array, chains: I32, size: I32
+):
+    """Each beam's first occupied step, for each chain.
+
+    ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph, ``labels`` (chains * size) 1 for
+    occupied; ``firsts`` (chains * beams) receives the steps.
+    """
+    beams = begins.shape[0] - 1
+    for i in range(chains * beams):
+        chain, f = i // beams, i % beams
+        first, steps = 0, begins[f + 1] - begins[f]
+        while first < steps and labels[chain * size + cells[begins[f] + first]] == 0:
+            first += 1
+        firsts[i] = first
+
+
+@ti.func
+def after_flip(
+    first: I32, step: I32, occupied: I32, begin: I32, steps: I32, cells: Template, labels: Template, base: I32
+) -> I32:
+    """A beam's first occupied step once the cell at ``step``, now ``occupied`` or not, is flipped.
+
+    A chain's labels begin at ``base``.
+    """
+    new: ti.i32 = first
+    if occupied == 0:
+        new = ti.min(first, step)
+    elif step == first:
+        new = step + 1
+        while new < steps and labels[base + cells[begin + new]] == 0:
+            new += 1
+    return new
+
+
+@ti.func
+def flip_change(
+    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32, graph: Template, lists: Template
+):
+    """Change of the energy by flipping ``cell``, in units: a sum of integers, so the list's order is free.
+    ``graph`` is a BeamGraph, ``lists`` are its CellLists."""
+    occupied = labels[base + cell]
+    change = ti.cast(0, ti.i64)
+    for i in range(lists.begins[cell], lists.begins[cell + 1]):
+        f = lists.beams[i]
+        step = ti.cast(lists.steps[i], ti.i32)
+        first = firsts[beam_base + f]
+        if step <= first:
+            beam = graph.beam(f)
+            new = after_flip(first, step, occupied, beam.begin, beam.steps, graph.cells, labels, base)
+            change += to_units(graph.energy_of(beam, new))
+            change -= to_units(graph.energy_of(beam, first))
+    return change
+
+
+@ti.func
+def flip(
+    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32, graph: Template, lists: Template
+):
+    """Flip ``cell``, and renew the first occupied steps of its beams."""
+    occupied = labels[base + cell]
+    for i in range(lists.begins[cell], lists.begins[cell + 1]):
+        f = lists.beams[i]
+        step = ti.cast(lists.steps[i], ti.i32)
+        first = firsts[beam_base + f]
+        if step <= first:
+            begin, end = graph.begins[f], graph.begins[f + 1]
+            firsts[beam_base + f] = after_flip(
+                first, step, occupied, begin, end - begin, graph.cells, labels, base
+            )
+    labels[base + cell] = 1 - occupied
+
 
 PROPOSAL, ACCEPTANCE = 0, 1
 """Purposes of a random number."""

@@ -15,13 +15,17 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.belief_propagation import BeliefPropagation
-from taichi_mrf.factor_graph.block_ascent import BlockAscent
 from taichi_mrf.factor_graph.config import LaserConfig, Method
-from taichi_mrf.factor_graph.dual_decomposition import DualDecomposition
-from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
+from taichi_mrf.factor_graph.dual_decomposition import BlockAscent, DualDecomposition
 from taichi_mrf.factor_graph.graph import CellLists, FactorGraph
-from taichi_mrf.factor_graph.inverse import inverse_model
-from taichi_mrf.factor_graph.metropolis_hastings import MetropolisHastings
+from taichi_mrf.factor_graph.metropolis_hastings import (
+    SPREAD,
+    MetropolisHastings,
+    find_firsts,
+    flip,
+    flip_change,
+    inverse_model,
+)
 from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph, energy, judged
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array

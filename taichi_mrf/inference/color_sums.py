@@ -18,8 +18,8 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layers import BrickValues, of_voxels
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
+from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.strips import strip_begin, strip_length
 
 MOST_PIXELS = 32.0
 """A keyframe's weight in a voxel stops growing at so many pixels."""

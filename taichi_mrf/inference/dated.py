@@ -23,7 +23,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.inference.dated_channels import (
     NEVER,
     Aging,
@@ -40,8 +40,8 @@ from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool, fill_bricks, read_bricks, write_bricks
-from taichi_mrf.voxels.strips import strip_length
 
 STEPS_A_HALF_LIFE = 64
 """Bricks that are not seen are brought up to date in so many steps for each half-life."""

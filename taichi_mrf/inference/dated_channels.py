@@ -10,8 +10,8 @@ from taichi_mrf.kernels.log_odds import faded
 from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import strip_begin
 from taichi_mrf.voxels.pool import grown
-from taichi_mrf.voxels.strips import strip_begin
 
 SURELY_FREE = 4.0
 """Log-odds below the prior from which a voxel counts as surely free, so that a view against it is a

@@ -5,7 +5,7 @@ from taichi_mrf.kernels.log_odds import moves
 from taichi_mrf.kernels.types import AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_begin
+from taichi_mrf.voxels.numbering import strip_begin
 
 
 @kernel

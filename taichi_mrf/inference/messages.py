@@ -11,8 +11,8 @@ from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.strips import strip_begin, strip_length
 
 
 def new_messages(visible: VisibleBricks, precision: str) -> "ti.Ndarray":

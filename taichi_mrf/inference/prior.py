@@ -2,7 +2,7 @@
 
 import math
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError
 
 

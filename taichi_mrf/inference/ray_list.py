@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template

@@ -28,9 +28,8 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.numbering import flat, strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool, PoolPart
-from taichi_mrf.voxels.strips import strip_begin, strip_length
 from taichi_mrf.voxels.traversal import InBricks, Space, Viewpoint, clip, cross_brick, walk_bricks
 
 

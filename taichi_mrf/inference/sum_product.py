@@ -55,7 +55,7 @@ from taichi_mrf.sensor.forward import AUTO
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_begin
+from taichi_mrf.voxels.numbering import strip_begin
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
 TINY = 1e-30
@@ -97,7 +97,7 @@ def cavity(
     ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - (1 - s) m) to ``log_free`` (n * 512),
     with log-odds bounded by ``lowest`` and ``highest`` and the logarithm ``log_pass`` of s
     (kernels/log_odds.py), and sets the ``sums`` (n * 512) to zero. ``strip`` is the
-    number of voxels for an iteration (voxels/strips.py), here and below.
+    number of voxels for an iteration (voxels/numbering.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
@@ -19,8 +19,8 @@ from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
 

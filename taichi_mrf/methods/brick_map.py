@@ -16,7 +16,7 @@ from taichi_mrf.config.arguments import instance, iterable, real, seconds, whole
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -24,10 +24,9 @@ from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import checked_points, classify, point_log_odds, probability
-from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import Answer, View
+from taichi_mrf.queries.survey import Occlusion
+from taichi_mrf.queries.view import Answer, RayProfile, View
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.frame import Frame

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.method import Method
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
-from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import RayProfile
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame

@@ -42,7 +42,7 @@ from taichi_mrf.methods.map_file import (
 )
 from taichi_mrf.methods.protocol import MapStatistics, measure
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS, fade_bricks
-from taichi_mrf.queries.occlusion import Occlusion
+from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
@@ -50,7 +50,7 @@ from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_length
+from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.window import Window
 
 FootprintT = TypeVar("FootprintT", bound=Footprint)

@@ -12,7 +12,7 @@ from taichi_mrf.kernels.log_odds import faded
 from taichi_mrf.kernels.types import F32, F32Array, I32Array, Template
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_begin
+from taichi_mrf.voxels.numbering import strip_begin
 
 UNKNOWN_LOG_ODDS = 0.0
 """The log-odds of a voxel that no scan has observed."""

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
-from taichi_mrf.queries.given_rays import GivenRays, WindowRays
+from taichi_mrf.queries.given_rays import GivenRays, RaySpace, WindowRays
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
-from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti

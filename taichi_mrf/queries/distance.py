@@ -29,8 +29,7 @@ from taichi_mrf.kernels.types import (
 )
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.distance_bricks import DistanceBricks
-from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid
-from taichi_mrf.queries.distance_rules import SpaceRules, UnknownSpace
+from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid, SpaceRules, UnknownSpace
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti

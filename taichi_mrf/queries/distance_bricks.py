@@ -20,13 +20,13 @@ from taichi_mrf.queries.distance_grid import (
     SAMPLES,
     SEEN_FREE,
     FieldGrid,
+    SpaceRules,
     classify_bricks,
     copy_all,
     fill_rows,
     keep_classes,
 )
 from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
-from taichi_mrf.queries.distance_rules import SpaceRules
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, seen_free_bricks
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime

@@ -23,9 +23,8 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
-from taichi_mrf.queries.occlusion import Occlusion, occlusion, stopped_share
-from taichi_mrf.queries.ray_space import RaySpace
-from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.queries.given_rays import RaySpace
+from taichi_mrf.queries.survey import OPAQUE, Occlusion, occlusion, stopped_share
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import widened

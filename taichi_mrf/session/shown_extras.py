@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config, without_window
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.pictures.overview import LIGHT, PERSPECTIVE, height_span
 from taichi_mrf.evaluation.pictures.surface_view import PHOTO_VOXEL_M, DrawnSurface, smooth_borders

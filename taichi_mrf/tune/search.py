@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
+from taichi_mrf.config.method import Range
 from taichi_mrf.config.schema import Config
-from taichi_mrf.config.sliders import Range
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, PoseConfig, without_window
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below

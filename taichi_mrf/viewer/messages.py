@@ -230,7 +230,7 @@ class Notice(Update):
 
 @dataclass(frozen=True)
 class RayAnswer(Update):
-    """The voxels along a ray, (n,) each, by range in metres; see queries.profile.RayProfile.
+    """The voxels along a ray, (n,) each, by range in metres; see queries.view.RayProfile.
 
     ``measured_m`` is the range that the keyframe measured, None without a measurement; ``bias_m`` and
     ``sigma_m`` are the sensor's noise at that range, along the ray.

@@ -21,7 +21,7 @@ from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_begin, strip_length
+from taichi_mrf.voxels.numbering import strip_begin, strip_length
 
 GROWTH = 1.2
 """A full pool grows by this factor: little enough that the slack does not show in the bytes a voxel."""
@@ -300,7 +300,7 @@ def grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
 @ti.kernel
 def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
     """Copy the voxels of the first ``bricks`` bricks. ``source`` and ``target`` are channels (capacity *
-    512); ``strip`` here and below: voxels/strips.py."""
+    512); ``strip`` here and below: voxels/numbering.py."""
     for part in range(bricks * (VOXELS // strip)):
         for k in range(strip):
             target[part * strip + k] = source[part * strip + k]

@@ -17,8 +17,8 @@ from taichi_mrf.calibration.from_recording import (
     learn_sigma,
     sigma_of_glance,
 )
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.errors import ConfigError, DatasetError

@@ -14,9 +14,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
-from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig, WavemapConfig
-from taichi_mrf.config.inference import InferenceConfig
-from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
@@ -28,9 +25,15 @@ from taichi_mrf.config.schema import (
     load,
     to_yaml,
 )
+from taichi_mrf.config.sections import (
+    InferenceConfig,
+    LogOddsConfig,
+    TimeConfig,
+    VisibilityConfig,
+    WavemapConfig,
+)
 from taichi_mrf.config.text import commented_yaml, differences, field_help
-from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.config.values import from_dict
+from taichi_mrf.config.values import from_dict, is_in_files
 from taichi_mrf.errors import ConfigError
 
 SECTIONS = (

@@ -10,8 +10,8 @@ from datasets_recordings import row_of, stamped_line
 from point_clouds import Walk, write_pcd, write_ply, write_scans, write_velodyne
 from refusals import refused
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M, LidarScans, reach_of
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise

@@ -8,8 +8,8 @@ import pytest
 from sliding_camera import CAMERA, SlidingCamera
 from stereo_rig import BASELINE, write_kitti
 
-from taichi_mrf.config.inference import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load
+from taichi_mrf.config.sections import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import StatedSensor
 from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR, with_recorded_noise, with_tuned_noise

@@ -14,8 +14,8 @@ import yaml
 
 import taichi_mrf
 import taichi_mrf.errors
-from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.schema import Config
+from taichi_mrf.config.values import is_in_files
 from taichi_mrf.factor_graph.config import LaserConfig
 
 REPOSITORY = Path(__file__).resolve().parents[2]

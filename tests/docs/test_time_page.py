@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 
 
 @pytest.fixture

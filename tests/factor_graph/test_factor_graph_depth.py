@@ -8,7 +8,7 @@ from one_pixel import ONE_PIXEL, VOXEL, ExactMap, allocated, image, look_along, 
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.factor_graph.beams import BrickCells

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from oracles import factor_graph as reference
 
 from taichi_mrf.factor_graph.beams import Beams
-from taichi_mrf.factor_graph.block_ascent import BlockAscent
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.factor_graph.dual_decomposition import DualDecomposition
+from taichi_mrf.factor_graph.dual_decomposition import BlockAscent, DualDecomposition
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.potentials import UNITS
 from taichi_mrf.factor_graph.solve import METHODS, Step, energy, solve

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.dated import in_time
 from taichi_mrf.kernels.bundles import kernel

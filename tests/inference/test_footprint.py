@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from oracles.forward import Noise
 from oracles.traversal import clip_to_box, segments
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box

@@ -26,9 +26,8 @@ from oracles import inference as reference
 from oracles.forward import Noise
 from oracles.traversal import segments
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.prior import prior_probability

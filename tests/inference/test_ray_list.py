@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import DepthImage, RayList, checked_depth
 from taichi_mrf.inference.ray_list import (
     AGREE_SIGMAS,

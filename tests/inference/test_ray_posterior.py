@@ -10,7 +10,7 @@ from one_pixel import VOXEL, allocated, look_along, marginals, well_cut
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.kernels.types import F32, I32, F32Array, Template

@@ -9,7 +9,7 @@ from oracles import inference as reference
 from oracles.forward import Noise
 from uncertain_wall import WALL_M, uncertain_wall
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.surface_votes import CALLED, GRAZED
 from taichi_mrf.methods.mrf import decided, keyframe_allocator

@@ -11,7 +11,7 @@ from one_pixel import VOXEL, FineMap, look_along
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.color_sums import WEIGHT_STEPS, ColorShare
 from taichi_mrf.inference.keyframe import Keyframe

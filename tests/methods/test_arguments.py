@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import taichi_mrf as tm
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import CapacityError, ConfigError, TaichiMRFError
 
 CAMERA = tm.PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from oracles.traversal import segments
 
-from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.config.sections import LogOddsConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.geometry.poses import Pose, look_at

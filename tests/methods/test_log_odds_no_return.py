@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import LogOddsConfig
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -8,7 +8,7 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.methods.mrf.map import MRFMap

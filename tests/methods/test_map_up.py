@@ -16,7 +16,7 @@ from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.registry import load_map
-from taichi_mrf.queries.slices import slice_map
+from taichi_mrf.queries.box import slice_map
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_npz

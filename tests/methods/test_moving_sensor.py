@@ -11,8 +11,8 @@ from moving_lidar import WAYS, lidar, mapped, motion, scan, score
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import oriented_points
-from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import LogOddsConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.methods.log_odds.map import LogOddsMap

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from window_walk import CHUNK_M, OUT, WINDOW_M, add, probes, unwindowed, walk, walk_both, windowed
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap

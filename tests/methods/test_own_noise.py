@@ -14,7 +14,7 @@ from one_pixel import VOXEL, ExactMap, allocated, random_pose
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.inference.prior import prior_probability

@@ -9,8 +9,8 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.config.baselines import VisibilityConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import VisibilityConfig
 from taichi_mrf.errors import KeyframeError, MapFileError
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.methods.log_odds.map import LogOddsMap

@@ -29,8 +29,8 @@ def test_nothing_outside_the_methods_asks_for_their_classes(repository: Path) ->
     )
     # A picture of a ray is labelled "visibility", a mean of messages is one of log-odds, and so on.
     words = {
-        "config/inference.py",
-        "config/gone.py",
+        "config/sections.py",
+        "config/values.py",
         "inference/sweep.py",
         "viewer/scene/ray_plot.py",
         "voxels/layers.py",

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from sliding_camera import ALL_FRAMES, WALL_M, sequence
 
-from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.sections import WavemapConfig
 from taichi_mrf.mapping.pipeline import map_sequence
 
 

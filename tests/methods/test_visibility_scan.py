@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import visibility as reference
 
-from taichi_mrf.config.baselines import VisibilityConfig
+from taichi_mrf.config.sections import VisibilityConfig
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import TABLE_I

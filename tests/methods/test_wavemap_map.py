@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from oracles import wavemap as reference
 
-from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.config.sections import WavemapConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, F32Array

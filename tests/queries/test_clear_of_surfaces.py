@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from queried_maps import HandMap, map_of
 
-from taichi_mrf.queries.clear_of_surfaces import CORE_VOXELS, Surfaces, stands_clear
+from taichi_mrf.queries.changed_things import CORE_VOXELS, Surfaces, stands_clear
 
 
 @pytest.fixture

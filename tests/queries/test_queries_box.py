@@ -12,7 +12,7 @@ from queried_maps import HandMap, hand_map, room, room_map
 
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.queries.box import map_extent, read_box
+from taichi_mrf.queries.box import MapSlice, map_extent, read_box, slice_map
 from taichi_mrf.queries.known_bricks import (
     BrickReader,
     brick_centres,
@@ -21,7 +21,6 @@ from taichi_mrf.queries.known_bricks import (
     seen_free_bricks,
 )
 from taichi_mrf.queries.points import FREE
-from taichi_mrf.queries.slices import MapSlice, slice_map
 from taichi_mrf.voxels.layout import BRICK
 
 

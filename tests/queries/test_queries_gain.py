@@ -11,7 +11,7 @@ from queried_maps import SEEN_FREE, HandMap, room_map
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.queries.gain import pixel_gain, view_gain
-from taichi_mrf.queries.occlusion import Occlusion
+from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.sensor.camera import PinholeCamera
 
 CAMERA = PinholeCamera(width=12, height=9, fx=10, fy=10.5, cx=5.8, cy=4.1)

@@ -8,7 +8,7 @@ import pytest
 import small_room
 from live_scene import CONFIG, FakeLink, RoomFrames, Shown, finished, map_voxels, session_of, shown
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.methods.registry import load_map

@@ -20,9 +20,8 @@ from small_room import VOXEL_SIZE, add, frames
 
 from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.cluster.local import LocalProcesses
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.export.fused_surface import FusedSurface

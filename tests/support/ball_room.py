@@ -6,7 +6,7 @@ import numpy as np
 import small_room
 from numpy.typing import NDArray
 
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene

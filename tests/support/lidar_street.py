@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.no_return import NoReturnFit, fit_no_return
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.spherical import SphericalCamera

@@ -3,8 +3,8 @@
 from functools import cache
 from typing import Any
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.system import runtime
 from taichi_mrf.tune.working_set import WorkingSet, read_working_set

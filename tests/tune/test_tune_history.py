@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.history import History
 from taichi_mrf.viewer.tune.messages import Tried

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob, find_parameter

@@ -7,8 +7,8 @@ import sys
 import pytest
 from tune_scene import CONFIG, working_set
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.search import DEFAULT_SEARCH, SIGMA_SCALE, Search, dimensions

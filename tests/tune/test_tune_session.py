@@ -8,8 +8,8 @@ import pytest
 from live_scene import FakeLink, shown
 from tune_scene import CHOICE, CONFIG, room, working_set
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig, load
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.session.session_core import Policy
 from taichi_mrf.tune.link import TuneOutbox
 from taichi_mrf.tune.search import Search

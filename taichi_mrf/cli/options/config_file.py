@@ -12,7 +12,7 @@ import tyro
 
 from taichi_mrf.config.files import find_config, read_yaml
 from taichi_mrf.config.schema import Config, load
-from taichi_mrf.config.time import LIVE_HALF_LIFE_S, TimeConfig
+from taichi_mrf.config.sections import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.runs.files import CONFIG_FILE

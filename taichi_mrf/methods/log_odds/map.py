@@ -18,10 +18,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import LogOddsConfig, TimeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.footprint import visible_box, window_around

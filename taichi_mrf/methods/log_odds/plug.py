@@ -1,7 +1,6 @@
 """The entry of the method log_odds. No Taichi here: this is imported for a --help."""
 
-from taichi_mrf.config.method import Method
-from taichi_mrf.config.sliders import Range, Slider
+from taichi_mrf.config.method import Method, Range, Slider
 
 METHOD = Method(
     name="log_odds",

@@ -19,7 +19,7 @@ from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.strips import strip_length
+from taichi_mrf.voxels.numbering import strip_length
 
 if TYPE_CHECKING:
     from taichi_mrf.inference.dated import DatedBelief

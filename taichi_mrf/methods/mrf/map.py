@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import instance
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
@@ -30,7 +29,7 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.protocol import MapStatistics
-from taichi_mrf.queries.occlusion import Occlusion, doubting
+from taichi_mrf.queries.survey import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.system import tensors

@@ -1,8 +1,7 @@
-"""The entry of the method mrf; its parameters are config/inference.py. No Taichi here: this is imported for a
+"""The entry of the method mrf; its parameters are config/sections.py. No Taichi here: this is imported for a
 --help."""
 
-from taichi_mrf.config.method import Method
-from taichi_mrf.config.sliders import Range, Slider
+from taichi_mrf.config.method import Method, Range, Slider
 
 METHOD = Method(
     name="mrf",

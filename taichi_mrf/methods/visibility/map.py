@@ -11,11 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.baselines import VisibilityConfig
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.sections import InferenceConfig, TimeConfig, VisibilityConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint

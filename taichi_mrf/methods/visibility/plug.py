@@ -1,7 +1,7 @@
 """The entry of the method visibility. No Taichi here: this is imported for a --help."""
 
-from taichi_mrf.config.baselines import VisibilityConfig
 from taichi_mrf.config.method import Method
+from taichi_mrf.config.sections import VisibilityConfig
 
 TABLE_I = VisibilityConfig(visible_if_occluded=0.2)
 """The parameters of the paper's Table I. They need a camera that moves less than a voxel a frame."""

@@ -4,7 +4,7 @@ the slider's. No page is needed to import it."""
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from taichi_mrf.config.sliders import Range
+from taichi_mrf.config.method import Range
 
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
 OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
 
-from taichi_mrf.config.sliders import Range
+from taichi_mrf.config.method import Range
 from taichi_mrf.config.text import field_help
 
 T = TypeVar("T")

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from taichi_mrf.config.method import Method
+from taichi_mrf.config.method import Method, Range, Slider, always
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
-from taichi_mrf.config.sliders import Range, Slider, always
 from taichi_mrf.config.text import field_help
 from taichi_mrf.config.values import unknown_key
 from taichi_mrf.errors import ConfigError
@@ -93,7 +92,7 @@ class Knob:
 
     With ``decades`` the slider shows the power of ten, and so does the range. ``method`` is the only one that
     reads the parameter, None if all do; ``counts`` says whether it changes anything under a configuration of
-    that method. ``by_factors`` and ``searched`` are for the automatic search (config.sliders.Slider).
+    that method. ``by_factors`` and ``searched`` are for the automatic search (config.method.Slider).
     """
 
     name: str

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.method import Range
 from taichi_mrf.config.schema import Config
-from taichi_mrf.config.sliders import Range
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.viewer.messages import Request, Update
 from taichi_mrf.viewer.tune.scores import Scores

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from oracles.forward import Noise
 from oracles.traversal import segments
-from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits
 from taichi_mrf.sensor.camera import PinholeCamera
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from oracles.forward import Noise
 from oracles.traversal import clip_to_box, segments
-from taichi_mrf.config.baselines import VisibilityConfig
+from taichi_mrf.config.sections import VisibilityConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 
 Voxel = tuple[int, int, int]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.baselines import WavemapConfig
+from taichi_mrf.config.sections import WavemapConfig
 
 Array = NDArray[np.float64]
 

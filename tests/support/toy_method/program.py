@@ -15,8 +15,8 @@ def main(folder: Path) -> None:
 
     import taichi_mrf
     from taichi_mrf.cli.main import parse
-    from taichi_mrf.config.baselines import LogOddsConfig
     from taichi_mrf.config.schema import Config, load
+    from taichi_mrf.config.sections import LogOddsConfig
     from taichi_mrf.config.text import commented_yaml
     from taichi_mrf.errors import TaichiMRFError
     from taichi_mrf.methods.registry import create_map, load_map

@@ -1,12 +1,116 @@
-"""The parameters of the baselines: log-odds, visibility-aware mapping, wavemap's model. They are here and not
-in the methods' folders because the whole configuration (schema.py) has a field for each."""
+"""The sections of parameters that belong to some mapping methods: time, inference on rays, and the baselines.
+
+They are here and not in the methods' folders because the whole configuration (schema.py) holds them, and
+inference/ and factor_graph/ read those on rays too.
+"""
 
 import math
 from dataclasses import dataclass
 from typing import Literal
 
-from taichi_mrf.config.places import in_python
-from taichi_mrf.config.values import check_field
+from taichi_mrf.config.values import check_field, in_files, in_python
+
+LIVE_HALF_LIFE_S = 14400.0
+"""The half-life that a live run has by default: people and chairs move. All else maps a static world."""
+
+
+@dataclass(frozen=True)
+class TimeConfig:
+    """How soon the world may change. Each voxel is a two-state Markov chain in time: what keyframes said of
+    the past counts for less, the longer ago it was, and never for more than the chance of a change since."""
+
+    half_life_s: float = 0.0
+    """Seconds after which half of what is known of a voxel is out of date: how soon may a chair move? With
+    14400 (four hours) a few views are enough to see what is new, whatever was there before. 0 is a world
+    that never changes, for surveys."""
+
+    moving_share: float = in_files(1e-6)
+    """Share of space that things which come and go fill. The smaller it is, the more views it takes until a
+    surface that was seen often counts as gone. Only mrf uses it."""
+
+    glimpse_half_life_s: float = in_files(2.0)
+    """Seconds after which half of a single view's claim is forgotten, if it contradicts what was known to be
+    free: a person who walks past. Later views confirm or deny it. Only mrf uses it."""
+
+    def __post_init__(self) -> None:
+        check_field(0 <= self.half_life_s < math.inf, "time.half_life_s", "must not be negative")
+        check_field(0 < self.moving_share <= 0.5, "time.moving_share", "must be above 0 and at most 0.5")
+        check_field(
+            0 < self.glimpse_half_life_s < math.inf, "time.glimpse_half_life_s", "must be a positive number"
+        )
+
+    @property
+    def is_static(self) -> bool:
+        """True if the world never changes."""
+        return self.half_life_s == 0
+
+    @property
+    def flip_rate(self) -> float:
+        """How often a voxel changes its state, per second, if both states are equally likely; 0 if static."""
+        return 0.0 if self.is_static else math.log(2.0) / (2.0 * self.half_life_s)
+
+    def forgotten(self, seconds: float) -> float:
+        """The share of a voxel's state that is drawn anew within some seconds: 1 - exp(-2 flip_rate t)."""
+        return -math.expm1(-2.0 * self.flip_rate * max(seconds, 0.0))
+
+
+LEAST_FLOOR = 1e-6
+"""The default of ``outlier_floor``, which holds for rays of any length."""
+
+
+@dataclass(frozen=True)
+class InferenceConfig:
+    """How the marginals are computed (MRFMap, sections III and IV)."""
+
+    sweeps: int = 3
+    """Number of sweeps over all keyframes. Each keyframe uses the newest messages of the others (Gauss-
+    Seidel)."""
+
+    renew_tolerance: float = 0.35
+    """Live mapping: sweep a keyframe again once other keyframes have changed more than this share of the
+    marginals that it sees by more than 0.01 each. Full inference ignores this."""
+
+    surface_density: float = 2.1
+    """Prior: expected number of surfaces per metre of ray. It means the same at every voxel size; 2.1 is the
+    paper's probability of 0.1 at 5 cm."""
+
+    prior: float | None = None
+    """Prior probability that a voxel is occupied. Overrides ``surface_density``."""
+
+    outlier_floor: float | None = None
+    """Density of outliers per metre of depth, added to both sides of every message. It keeps a single wrong
+    pixel from overruling all others. By default 1e-6; 0.01 where a recording's rays are short."""
+
+    ray_density: float = 2.5
+    """Minimum rays cast at a voxel facing the camera, per centimetre of voxel size: 12.5 rays at 5 cm, 2.5 at
+    1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
+
+    pass_through: float | None = None
+    """Chance that a ray passes through an occupied voxel, below 1, because what is in it fills only a part.
+    With 0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs
+    stay in the map. By default 0.1 for a lidar's recording and 0 for all others. factor_graph() takes it as
+    0."""
+
+    free_share: float = 0.25
+    """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see
+    as free may still stop a ray."""
+
+    @property
+    def floor(self) -> float:
+        """The density of outliers that is in force."""
+        return LEAST_FLOOR if self.outlier_floor is None else self.outlier_floor
+
+    def __post_init__(self) -> None:
+        check_field(self.sweeps >= 0, "inference.sweeps", "must not be negative")
+        check_field(self.renew_tolerance >= 0, "inference.renew_tolerance", "must not be negative")
+        check_field(self.surface_density > 0, "inference.surface_density", "must be positive")
+        check_field(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
+        check_field(self.floor >= 0, "inference.outlier_floor", "must not be negative")
+        check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
+        share = self.pass_through or 0.0
+        check_field(0 <= share < 1, "inference.pass_through", "must be at least 0 and less than 1")
+        check_field(0 <= self.free_share <= 1, "inference.free_share", "must lie between 0 and 1")
+
 
 LEAST_RANGE_SIGMA_M = 0.05
 """The noise of an Ouster OS0 (metres), below which the range's sigma is not set by the voxel size."""
