@@ -113,8 +113,7 @@ class MRFMap(BrickMap):
 
     @property
     def settled(self) -> bool:
-        """True if the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
-        stopped, and no keyframe changed since."""
+        """True after a complete :meth:`infer` with the configured sweeps, until a keyframe changes."""
         return self._parts.settled
 
     @property
@@ -157,7 +156,9 @@ class MRFMap(BrickMap):
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
         given = (color, noise, sigma_m, no_return, pose_covariance)
+        # Step 1, intake: axial depth d_r of each pixel, checked and with its noise on the device.
         image = self._parts.image(self.noise, depth_m, camera, *given)
+        # Step 2, rays: which are cast and which bricks they cross (section IV-B). Steps 3 to 6 are infer's.
         keyframe = self._parts.allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
@@ -168,8 +169,7 @@ class MRFMap(BrickMap):
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove a keyframe, its messages, and every brick that no other keyframe owns. Raises
-        KeyframeError."""
+        """Remove a keyframe, its messages, and each brick that no other owns. Raises KeyframeError."""
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
