@@ -47,7 +47,7 @@ class SpaceRules:
 
     @property
     def reach_bricks(self) -> int:
-        """How many bricks away a state can change a distance."""
+        """Bricks up to which a state can change a distance."""
         return -(-self.reach // BRICK)
 
     @property

@@ -1,4 +1,4 @@
-"""How much a voxel dims a ray that passes through it.
+"""Dimming of a ray by the voxels that it passes through.
 
 Occupancy is read as a medium: a voxel of probability p has the occlusion density
 alpha = -ln(1 - p) / voxel size (MRFMap, section III-D).
@@ -16,8 +16,8 @@ from taichi_mrf.voxels.traversal import FAR
 
 @dataclass(frozen=True)
 class Occlusion(Bundle):
-    """Which voxels let every ray through, and how sure a view is of the others, by their log-odds of being
-    occupied."""
+    """The voxels that let every ray through, and how sure a view is of the others, by their log-odds of
+    being occupied."""
 
     unknown: F32 = FAR
     """Log-odds that stand for "never seen" in maps that mark it so."""

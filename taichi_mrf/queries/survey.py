@@ -47,7 +47,7 @@ class SurfaceSurvey:
 
 @dataclass(frozen=True)
 class Medium(Bundle):
-    """How a survey reads the map (View)."""
+    """A survey's way of reading the map (View)."""
 
     voxel_size: F32
     """Metres."""
@@ -59,7 +59,7 @@ class Medium(Bundle):
     """Log-odds above which a voxel can be the surface."""
 
     occlusion: Occlusion
-    """How voxels dim rays."""
+    """The voxels that let rays through, and the way others dim them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How kernels number voxels and cells; the levels themselves are in layout.py, which needs no Taichi."""
+"""Numbers of voxels and cells in kernels; the levels themselves are in layout.py, which needs no Taichi."""
 
 from taichi_mrf.kernels.types import I32, IVec3
 from taichi_mrf.system.compiler import ti

@@ -1,4 +1,4 @@
-"""How kernels pass over the voxels of some bricks: a strip of voxels for each iteration of the parallel loop.
+"""Loops of kernels over the voxels of bricks: a strip of voxels for each iteration of the parallel loop.
 
 On a CPU an iteration of a Taichi loop costs more than what is done to a voxel, and neighbouring voxels share
 cache lines. On a GPU an iteration is a thread, and neighbouring threads should take neighbouring voxels.

@@ -1,4 +1,4 @@
-"""Which voxels a triangle passes through, exactly: its box and the triangle overlap, or they do not.
+"""The voxels that a triangle passes through, exactly: its box and the triangle overlap, or they do not.
 
 Schwarz and Seidel (2010): they overlap if and only if the box meets the triangle's plane and bounding box,
 and their projections along each of the three axes overlap. A triangle is taken apart into rows of columns
