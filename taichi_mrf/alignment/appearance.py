@@ -1,4 +1,4 @@
-"""Which keyframes look like an image: small, coarse pictures of inverse depth and of brightness, compared by
+"""Likeness of keyframes to an image: small, coarse pictures of inverse depth and of brightness, compared by
 their correlation. It tells views from about the same place in about the same direction, and nothing more
 exact: an alignment has to follow."""
 
@@ -54,13 +54,13 @@ class Appearances:
         self._pictures[id] = picture
 
     def like(self, id: int) -> dict[int, float]:
-        """How much each other keyframe looks like keyframe ``id``; see :meth:`likeness`."""
+        """Likeness of each other keyframe to keyframe ``id``; see :meth:`likeness`."""
         likeness = self.likeness(self._pictures[id])
         del likeness[id]
         return likeness
 
     def likeness(self, picture: Picture) -> dict[int, float]:
-        """How much each keyframe looks like a picture, -1 to 1: the mean correlation of what both have."""
+        """Likeness of each keyframe to a picture, -1 to 1: the mean correlation of what both have."""
         if not self._pictures:
             return {}
         pictures = np.stack(list(self._pictures.values()))

@@ -19,14 +19,14 @@ COARSEST_M = 0.08
 """Least width of the first level's cells, in metres. Surfaces further away than 1.5 cells are not found."""
 
 THINNED = (4, 2, 1)
-"""Which of the points each level takes along rows and columns: strides of 8, 4 and 2 pixels."""
+"""Steps between the points that each level takes along rows and columns: strides of 8, 4 and 2 pixels."""
 
 LEAST_POINTS = 50
 """Points that an alignment needs, however small the image."""
 
 
 def margin_m(cell_size: float) -> float:
-    """How far beyond the points the surface is used, in metres."""
+    """Metres beyond the points up to which the surface is used."""
     return 2 * max(cell_size, COARSEST_M)
 
 

@@ -18,50 +18,17 @@ from taichi_mrf.alignment.levels import (
     margin_m,
 )
 from taichi_mrf.alignment.levenberg import Aligned
-from taichi_mrf.alignment.locate_around import FINEST_CELLS_M, found_around
+from taichi_mrf.alignment.locate_around import found_around
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.point_to_plane import LARGEST_COST, NormalEquations, PointToPlane
 from taichi_mrf.alignment.recorded import Recorded
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.seen_through import Sightlines, looked_through
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe
-
-LEAST_AGREEMENT = 0.5
-"""Share of the points with a surface near them that must lie on it, or the image was taken elsewhere."""
-
-FIRST_CELLS_M = 0.2
-"""Width of the first level's cells. With 0.08 a camera that moves by 9 cm and 6 degrees from one image to
-the next is lost at once; with 0.3 it is found no better."""
-
-OBSERVABLE = 0.0005
-"""Least share of the largest eigenvalue that a direction needs. Where a recorded pose is rather kept, a guess
-drifts: with ten times as much a camera at 30 images a second slid 20 cm along a wall of the built-in room."""
-
-OBSERVABLE_BY_DEPTH = 0.005
-"""OBSERVABLE where the guess is seen in the colours, and right to a centimetre, and depth would carry the
-camera far away. With a tenth of it, depth carries a handheld camera 32 cm away from where colours show it."""
-
-WELL = 0.7
-"""Share of the points that must lie on the map at a pose near a guess, or a sensor that sees around is
-searched for further away. Scans of a real building that fit near a guess by mistake have at most 0.62, those
-that are right 0.76 and more. Depth cameras, which are not searched for, keep what agrees as above."""
-
-LITTLE = 0.03
-"""Share of the map that such a scan may look through. Without this test 2 of 60 scans of the built-in
-corridor are put 1.6 m from where they were taken, at the door before, with fits of 0.8."""
-
-WORSE_BY_COLOR = 0.02
-"""How much fewer of its points may agree with the map where its colours fit than where its depth does."""
-
-CARRIED_M = 0.08
-"""Metres from a guess beyond which the directions that depth determines badly have to prove themselves: the
-pose without them must be as near to it. At a door they carry a handheld camera up to 27 cm away."""
-
-AHEAD_M = 1.0
-"""Metres by which the surface's grids reach beyond the points, so that they serve more than one image."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +65,11 @@ class Locator:
         config: PoseConfig,
         around: Around | None = None,
         colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
-        observable: float = OBSERVABLE,
+        observable: float = RULES.observable,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
         the end that fits best and is nearest to its guess counts. ``config`` bounds how far from a guess, and
-        how much overlap is needed. If that finds nothing, or nothing that fits WELL, the image of a sensor
+        how much overlap is needed. If that finds nothing, or nothing that fits well, the image of a sensor
         that sees around is searched for ``around``, and the outcome of that counts. ``colors``, of a camera
         that does not, is what the image can be compared with at a pose. ``observable``: the share of the
         largest eigenvalue that a direction needs to be moved in by depth near the guesses."""
@@ -112,13 +79,13 @@ class Locator:
         self._surface.update(keyframes)
         if around is None:
             return self._near(points, guesses, config, 0.0, colors, observable)
-        near, sight = self._near(points, guesses, config, FINEST_CELLS_M), Sightlines.of(image)
+        near, sight = self._near(points, guesses, config, RULES.around_finest_m), Sightlines.of(image)
         begin = [] if near.T_world_camera is None else [near.T_world_camera]
-        well = bool(begin) and near.overlap * near.agreement > WELL
-        if well and sight.seen_through(self._grids[-1].surface, begin[0]) < LITTLE:
+        well = bool(begin) and near.overlap * near.agreement > RULES.well
+        if well and sight.seen_through(self._grids[-1].surface, begin[0]) < RULES.scan_through:
             return near
         surface = self._surface.around(*around.box(points))
-        end, reason = found_around(points, sight, surface, around, begin, config, OBSERVABLE)
+        end, reason = found_around(points, sight, surface, around, begin, config, RULES.observable)
         return _judged(end, reason, config)
 
     def looked_through(self, image: DepthImage, T_world_camera: Pose) -> float:
@@ -132,7 +99,7 @@ class Locator:
         config: PoseConfig,
         finest_m: float,
         colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
-        observable: float = OBSERVABLE,
+        observable: float = RULES.observable,
     ) -> Located:
         """The best of the ends of searches from some guesses, in cells of ``finest_m`` metres at the end, and
         from there on with colour, unless depth would fit worse."""
@@ -154,8 +121,8 @@ class Locator:
         compared = colors(end.T_world_camera) if colors is not None else ()
         if compared:
             T = end.T_world_camera
-            colored = aligned_with_color(levels, compared, T, priors[best], lever_m, OBSERVABLE)
-            least = max(LEAST_AGREEMENT, agreement(end.equations) - WORSE_BY_COLOR)
+            colored = aligned_with_color(levels, compared, T, priors[best], lever_m, RULES.observable)
+            least = max(RULES.least_agreement, agreement(end.equations) - RULES.worse_by_color)
             if colored.equations.overlap >= config.min_overlap and agreement(colored.equations) > least:
                 end = colored
         turned, shifted = tangent_norms(guess, end.T_world_camera)
@@ -170,8 +137,8 @@ class Locator:
         lower, upper = bounds(points, guesses, margin_m(max(self._surface.cell_size, finest_m)))
         held = self._box is not None and (lower >= self._box[0]).all() and (upper <= self._box[1]).all()
         if not held or self._revision != self._surface.revision:
-            self._box = (lower - AHEAD_M, upper + AHEAD_M)
-            self._grids = grids_of(self._surface.around(*self._box), FIRST_CELLS_M, finest_m)
+            self._box = (lower - RULES.grids_ahead_m, upper + RULES.grids_ahead_m)
+            self._grids = grids_of(self._surface.around(*self._box), RULES.first_cells_m, finest_m)
             self._revision = self._surface.revision
         return self._grids
 
@@ -182,11 +149,11 @@ def _not_carried_away(
     """End of a search from a guess. If it is far from there, directions that depth determines badly are left
     out, unless they change little."""
     end = aligned(levels, guess, prior, lever_m, observable)
-    if tangent_norms(guess, end.T_world_camera)[1] < CARRIED_M:
+    if tangent_norms(guess, end.T_world_camera)[1] < RULES.carried_m:
         return end
-    sure = aligned(levels, guess, prior, lever_m, OBSERVABLE_BY_DEPTH)
+    sure = aligned(levels, guess, prior, lever_m, RULES.observable_by_depth)
     carried_m = tangent_norms(sure.T_world_camera, end.T_world_camera)[1]
-    return end if carried_m < CARRIED_M else sure
+    return end if carried_m < RULES.carried_m else sure
 
 
 def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
@@ -198,7 +165,7 @@ def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
             f"{100 * overlap:.0f}% of its points lie near what is mapped, "
             f"and {100 * config.min_overlap:.0f}% are needed"
         )
-    elif agrees < LEAST_AGREEMENT:
+    elif agrees < RULES.least_agreement:
         reason = f"{100 * agrees:.0f}% of its points agree with the map"
     pose = None if reason else end.T_world_camera
     return Located(pose, reason, overlap, agrees, end.equations.rms_m, end.directions)

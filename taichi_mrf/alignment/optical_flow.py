@@ -1,4 +1,4 @@
-"""How a camera has moved between two colour images, from corners that are followed by optical flow.
+"""Motion of a camera between two colour images, from corners that are followed by optical flow.
 
 Corners of the earlier image that have depth are points in space. Where the later image shows them gives its
 pose (perspective n points), whatever shape the place has: along a bare wall, depth alone does not determine

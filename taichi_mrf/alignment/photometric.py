@@ -136,7 +136,7 @@ def _projected(
 
 
 def _spread(image: ContrastImage, uv: NDArray[np.float64]) -> float:
-    """How far points at columns and rows (N, 2) are spread over the image, from 0 to 1."""
+    """Spread of points at columns and rows (N, 2) over the image, from 0 to 1."""
     tiles = (uv * TILES / (image.camera.width, image.camera.height)).astype(np.intp)
     share = len(np.unique(tiles @ (TILES, 1))) / TILES**2
     return float(np.clip((share - LEAST_SPREAD) / (ENOUGH_SPREAD - LEAST_SPREAD), 0, 1))

@@ -99,7 +99,7 @@ class _Points(Bundle):
 
 @dataclass(frozen=True)
 class _Strips(Bundle):
-    """How the points are divided: a strip's points are added up one after the other, so that the sums do not
+    """Division of the points: a strip's points are added up one after the other, so that the sums do not
     depend on the number of threads."""
 
     number: I32

@@ -14,15 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from taichi_mrf.alignment.pose_equations import PoseEquations
-from taichi_mrf.alignment.se3 import adjoint, cross_matrix
+from taichi_mrf.alignment.se3 import Twists, adjoint, exps, inverse_right_jacobians, logs
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverses
-
-Twists = NDArray[np.float64]
-"""(n, 6): translations in metres, then rotation vectors in radians."""
 
 REJECTED = 16.8
 """e' Omega e at which an uncertain edge counts a quarter: one in a hundred right ones is larger (chi squared
@@ -42,9 +38,6 @@ LARGEST_DAMPING = 1e6
 
 SMALLEST_STEP = 1e-5
 """Metres or radians: a smaller step is the last."""
-
-SMALL_ANGLE = 1e-4
-"""Radians below which the limits of the closed forms are more precise than they are."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ class _Problem:
             if not self.free.any() or len(self.first) == 0:
                 break
             step = self._step(error, trust, damping)
-            tried_T = self.T @ _exp(step)
+            tried_T = self.T @ exps(step)
             tried = self._errors(tried_T)
             before, after = self._cost(error, trust), self._cost(tried, trust)
             if after <= before:
@@ -110,7 +103,7 @@ class _Problem:
 
     def _errors(self, T: NDArray[np.float64]) -> Twists:
         """e of each edge."""
-        return _log(inverses(self.Z) @ inverses(T[self.first]) @ T[self.second])
+        return logs(inverses(self.Z) @ inverses(T[self.first]) @ T[self.second])
 
     def _squares(self, error: Twists) -> NDArray[np.float64]:
         """e' Omega e of each edge."""
@@ -129,42 +122,9 @@ class _Problem:
         """The damped step of every pose, (n, 6), 0 for those that are fixed."""
         # With T exp(xi), e changes by inv(J_r(e)) (xi_second - Ad(inv(T_second) T_first) xi_first).
         to_first = -adjoint(inverses(self.T[self.second]) @ self.T[self.first])
-        J = _inverse_right_jacobian(error)
+        J = inverse_right_jacobians(error)
         weighted = trust[:, None, None] * np.swapaxes(J, -1, -2) @ self.information
         H, g = weighted @ J, np.einsum("nij,nj->ni", weighted, error)
         equations = PoseEquations(len(self.ids))
         equations.add_pairs(self.second, self.first, to_first, H, g)
         return equations.step(self.free, damping)
-
-
-def _inverse_right_jacobian(e: Twists) -> NDArray[np.float64]:
-    """(n, 6, 6): what a step behind exp(e) changes of e, but for terms of the fourth order."""
-    ad = np.zeros((len(e), 6, 6))
-    ad[:, :3, :3] = ad[:, 3:, 3:] = cross_matrix(e[:, 3:])
-    ad[:, :3, 3:] = cross_matrix(e[:, :3])
-    return np.asarray(np.eye(6) + 0.5 * ad + ad @ ad / 12)
-
-
-def _exp(xi: Twists) -> NDArray[np.float64]:
-    """(n, 4, 4): as se3.moved, of many."""
-    T = np.zeros((len(xi), 4, 4))
-    T[:, :3, :3] = Rotation.from_rotvec(xi[:, 3:]).as_matrix()
-    angle = np.linalg.norm(xi[:, 3:], axis=1)
-    safe = np.maximum(angle, SMALL_ANGLE)
-    first = np.where(angle > SMALL_ANGLE, (1 - np.cos(safe)) / safe**2, 0.5)
-    second = np.where(angle > SMALL_ANGLE, (safe - np.sin(safe)) / safe**3, 1 / 6)
-    turned = np.cross(xi[:, 3:], xi[:, :3])
-    T[:, :3, 3] = xi[:, :3] + first[:, None] * turned + second[:, None] * np.cross(xi[:, 3:], turned)
-    T[:, 3, 3] = 1.0
-    return T
-
-
-def _log(T: NDArray[np.float64]) -> Twists:
-    """(n, 6): as se3.twist, of many."""
-    omega = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-    angle = np.linalg.norm(omega, axis=1)
-    safe = np.maximum(angle, SMALL_ANGLE)
-    bend = np.where(angle > SMALL_ANGLE, 1 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)), 1 / 12)
-    turned = np.cross(omega, T[:, :3, 3])
-    rho = T[:, :3, 3] - 0.5 * turned + bend[:, None] * np.cross(omega, turned)
-    return np.concatenate([rho, omega], axis=1)

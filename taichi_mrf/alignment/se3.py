@@ -1,13 +1,20 @@
-"""Small steps of a pose: the exponential map of SE(3), its inverse, and how steps change frames."""
+"""SE(3): its exponential map, the inverse of that, for one pose and for many, and steps in other frames."""
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from taichi_mrf.geometry.poses import Pose
 
+Twists = NDArray[np.float64]
+"""(n, 6): translations in metres, then rotation vectors in radians."""
+
 _SMALL = 1e-2
 """Radians below which a series is more precise than the closed form."""
+
+_SMALL_OF_MANY = 1e-4
+"""Radians below which the limits of the closed forms are more precise than they are."""
 
 
 def moved(T_world_camera: Pose, xi: ArrayLike) -> Pose:
@@ -24,6 +31,39 @@ def twist(T: Pose) -> NDArray[np.float64]:
     """The xi, (6,), of T = exp(xi)."""
     omega = _rotation_vector(T[:3, :3])
     return np.concatenate([np.linalg.solve(_left_jacobian(omega), T[:3, 3]), omega])
+
+
+def exps(xi: Twists) -> NDArray[np.float64]:
+    """(n, 4, 4): the poses exp(xi) of many twists."""
+    T = np.zeros((len(xi), 4, 4))
+    T[:, :3, :3] = Rotation.from_rotvec(xi[:, 3:]).as_matrix()
+    angle = np.linalg.norm(xi[:, 3:], axis=1)
+    safe = np.maximum(angle, _SMALL_OF_MANY)
+    first = np.where(angle > _SMALL_OF_MANY, (1 - np.cos(safe)) / safe**2, 0.5)
+    second = np.where(angle > _SMALL_OF_MANY, (safe - np.sin(safe)) / safe**3, 1 / 6)
+    turned = np.cross(xi[:, 3:], xi[:, :3])
+    T[:, :3, 3] = xi[:, :3] + first[:, None] * turned + second[:, None] * np.cross(xi[:, 3:], turned)
+    T[:, 3, 3] = 1.0
+    return T
+
+
+def logs(T: NDArray[np.float64]) -> Twists:
+    """(n, 6): the twists of many poses."""
+    omega = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    angle = np.linalg.norm(omega, axis=1)
+    safe = np.maximum(angle, _SMALL_OF_MANY)
+    bend = np.where(angle > _SMALL_OF_MANY, 1 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)), 1 / 12)
+    turned = np.cross(omega, T[:, :3, 3])
+    rho = T[:, :3, 3] - 0.5 * turned + bend[:, None] * np.cross(omega, turned)
+    return np.concatenate([rho, omega], axis=1)
+
+
+def inverse_right_jacobians(e: Twists) -> NDArray[np.float64]:
+    """(n, 6, 6): what a step behind exp(e) changes of e, but for terms of the fourth order."""
+    ad = np.zeros((len(e), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = cross_matrix(e[:, 3:])
+    ad[:, :3, 3:] = cross_matrix(e[:, :3])
+    return np.asarray(np.eye(6) + 0.5 * ad + ad @ ad / 12)
 
 
 def adjoint(T_a_b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""How much of a mapped surface a scan looks through: what gives away a pose that fits by chance.
+"""Share of a mapped surface that a scan looks through: what gives away a pose that fits by chance.
 
 In a hall of equal bays the walls of a scan may lie on those of the next bay. What stands only there is then
 in the way of rays that went on.

@@ -13,43 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
-
-FINEST_CELL_M, WIDEST_CELL_M = 0.25, 0.5
-"""Widths of the grid's cells, and the distance between places: in rooms and corridors, and in halls."""
-
-CELLS_TO_MEDIAN = 12
-"""Cells that the median of a scan's ranges is long, within those bounds."""
-
-HEADINGS = 96
-"""Headings that are tried, 3.75 degrees apart."""
-
-FARTHEST = 40
-"""Points further away than so many cells are left out: half a step between headings moves them by more than a
-cell."""
-
-MOST_POINTS = 500
-"""Points that count. There is one for each cell that holds any, so that near ones are not the most."""
-
-APART, APART_RAD = 2.0, 0.3
-"""A pose that is closer than so many cells and radians to a better one is no candidate of its own."""
-
-CANDIDATES = 8
-"""How many poses come out of a search. The right one was among the best three for all scans of a real
-building one step ahead of the map (51 steps of up to 2.3 m and 95 degrees), and among all for all two steps
-ahead."""
-
-UPRIGHT = float(np.cos(np.radians(45.0)))
-"""Cosine of the largest angle between a floor's normal and what was upwards before. A lidar that is carried
-is tilted by up to 35 degrees in the building."""
-
-LEVEL = float(np.cos(np.radians(10.0)))
-"""Cosine of the largest angle between normals that are floors and ceilings of the same building."""
 
 _SIDES = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(8) * np.pi / 4] + [[0, 0, 1], [0, 0, -1]])
 """(10, 3) directions by which normals are sorted, with z up: eight headings, up and down. A cell has a bit
@@ -126,14 +96,15 @@ def candidates(points: OrientedPoints, surface: Planes, around: Around) -> list[
     up_camera = upright(points.normals.astype(np.float64), T_last[:3, :3].T @ up_world)
     R_level_world, R_level_camera = level_frame(up_world), level_frame(up_camera)
     ranges_m = np.linalg.norm(points.points, axis=1)
-    cell_m = float(np.clip(np.median(ranges_m) / CELLS_TO_MEDIAN, FINEST_CELL_M, WIDEST_CELL_M))
+    wanted_m = np.median(ranges_m) / RULES.cells_to_median
+    cell_m = float(np.clip(wanted_m, RULES.grid_finest_m, RULES.grid_widest_m))
     chosen = spread(points.points, cell_m)
     if len(chosen) == 0:
         return [T_last]
     level_points = points.points[chosen] @ R_level_camera.T
     level_normals = points.normals[chosen] @ R_level_camera.T
     # The cells of all points under each heading, and the steps from place to place.
-    headings = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
+    headings = np.linspace(0.0, 2 * np.pi, RULES.headings, endpoint=False)
     turns = np.stack([turn_about_z(heading) for heading in headings])
     cells = np.floor(np.einsum("hab,nb->hna", turns, level_points) / cell_m).astype(np.int64)
     sides = np.argmax(np.einsum("hab,nb->hna", turns, level_normals) @ _SIDES.T, axis=-1)
@@ -148,7 +119,7 @@ def candidates(points: OrientedPoints, surface: Planes, around: Around) -> list[
     counts = scores(grid, cells, sides, steps)
     # The best poses that are apart from each other.
     found = []
-    for heading, place in peaks(counts, headings, steps * cell_m, APART * cell_m):
+    for heading, place in peaks(counts, headings, steps * cell_m, RULES.candidates_apart * cell_m):
         T = np.eye(4)
         T[:3, :3] = R_level_world.T @ turns[heading] @ R_level_camera
         T[:3, 3] = T_last[:3, 3] + R_level_world.T @ (steps[place] * cell_m)
@@ -161,13 +132,13 @@ def upright(normals: NDArray[np.float64], expected: NDArray[np.float64]) -> NDAr
     floors and ceilings, lie along; what is expected if there are none."""
     along = normals @ expected
     flat = normals * np.sign(along)[:, None]
-    flat = flat[np.abs(along) > UPRIGHT]
+    flat = flat[np.abs(along) > RULES.upright]
     if len(flat) == 0:
         return expected / np.linalg.norm(expected)
     some = flat[:: max(1, len(flat) // 300)]
-    up = some[np.argmax((some @ some.T > LEVEL).sum(axis=1))]
+    up = some[np.argmax((some @ some.T > RULES.level).sum(axis=1))]
     for _ in range(3):
-        up = flat[flat @ up > LEVEL].mean(axis=0)
+        up = flat[flat @ up > RULES.level].mean(axis=0)
         up = up / np.linalg.norm(up)
     return up
 
@@ -187,11 +158,11 @@ def turn_about_z(angle: float) -> NDArray[np.float64]:
 
 
 def spread(points_m: NDArray[np.float32], cell_m: float) -> NDArray[np.intp]:
-    """Numbers of at most MOST_POINTS points (N, 3), not too far away, none two in one cell."""
-    near = np.flatnonzero(np.linalg.norm(points_m, axis=1) < FARTHEST * cell_m)
+    """Numbers of some points (N, 3), not too far away, none two in one cell."""
+    near = np.flatnonzero(np.linalg.norm(points_m, axis=1) < RULES.farthest_cells * cell_m)
     _, first = np.unique(np.floor(points_m[near] / cell_m).astype(np.int64), axis=0, return_index=True)
     chosen = near[np.sort(first)]
-    some = np.linspace(0, len(chosen) - 1, min(MOST_POINTS, len(chosen))).round().astype(np.intp)
+    some = np.linspace(0, len(chosen) - 1, min(RULES.most_points, len(chosen))).round().astype(np.intp)
     return chosen[some]
 
 
@@ -230,15 +201,14 @@ def peaks(
     places_m: NDArray[np.float64],
     apart_m: float,
 ) -> list[tuple[int, int]]:
-    """The numbers of the headings and places of the CANDIDATES highest counts that are apart from higher
-    ones."""
+    """The numbers of the headings and places of the highest counts that are apart from higher ones."""
     left, found = counts.copy(), []
-    for _ in range(CANDIDATES):
+    for _ in range(RULES.candidates):
         heading, place = (int(i) for i in np.unravel_index(np.argmax(left), left.shape))
         if left[heading, place] <= 0:
             break
         found.append((heading, place))
-        turned = np.abs((headings - headings[heading] + np.pi) % (2 * np.pi) - np.pi) < APART_RAD
+        turned = np.abs((headings - headings[heading] + np.pi) % (2 * np.pi) - np.pi) < RULES.apart_rad
         shifted = np.linalg.norm(places_m - places_m[place], axis=1) < apart_m
         left[np.ix_(turned, shifted)] = 0
     return found

@@ -52,7 +52,7 @@ class BrickSums:
         return BrickSums(bricks[first], sums)
 
     def inside(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Which of the bricks lie in some chunks (n, 3)."""
+        """True for the bricks that lie in some chunks (n, 3)."""
         return np.isin(grid_keys(self.bricks // CHUNK), grid_keys(chunks))
 
     def chosen(self, rows: NDArray[np.bool_]) -> "BrickSums":

@@ -1,4 +1,4 @@
-"""Which bricks a depth image sees: those that its rays cross, and those at the surfaces it measured.
+"""The bricks that a depth image sees: those that its rays cross, and those at the surfaces it measured.
 
 Bricks are allocated near measured surfaces only (section IV-B). The bricks in front of them are recorded too:
 they separate seen-free from unknown space, and give the bricks of other keyframes that the rays cross.
@@ -124,7 +124,7 @@ def visible_box(
 
 @dataclass(frozen=True)
 class _Reach(Bundle):
-    """How far rays are followed."""
+    """Bounds of the way along which rays are followed."""
 
     min_depth: F32
     """Metres of depth before which they cross nothing."""

@@ -164,7 +164,7 @@ class RayList(Bundle):
     """(n): each ray's measurement, the mean of its pixels, in metres."""
 
     number: I32
-    """How many entries are rays."""
+    """Number of entries that are rays."""
 
     widest: I32
     """Largest number of pixels along a block's side."""

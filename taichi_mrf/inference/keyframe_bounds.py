@@ -1,4 +1,4 @@
-"""Which keyframes see a part of space: a quick test of their bounding boxes."""
+"""The keyframes that may see a part of space: a quick test of their bounding boxes."""
 
 import numpy as np
 from numpy.typing import NDArray

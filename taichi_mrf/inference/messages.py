@@ -59,7 +59,7 @@ def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
 def count_observations(
     slots: NDArray[np.int32], keyframes: Iterable[tuple[VisibleBricks, "ti.Ndarray"]], pool: BrickPool
 ) -> NDArray[np.uint8]:
-    """How many keyframes have a message to each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".
+    """Number of keyframes with a message to each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".
 
     ``keyframes`` are their lists of bricks with their messages. All frozen keyframes count as one.
     """

@@ -1,4 +1,4 @@
-"""Which rays a keyframe casts: its pixels, or bundles of pixels where a voxel covers many.
+"""The rays that a keyframe casts: its pixels, or bundles of pixels where a voxel covers many.
 
 Near the camera a voxel covers hundreds of pixels, whose rays send it nearly the same message. Blocks of
 pixels are therefore merged, two of a size at a time, as long as enough rays still meet a voxel at their depth

@@ -44,7 +44,7 @@ SURE = 0.99
 
 @dataclass(frozen=True)
 class Band(Bundle):
-    """How far to either side of its surface a ray counts."""
+    """The band to either side of its surface in which a ray counts."""
 
     voxels: F32
     """At least so many voxels,"""

@@ -1,4 +1,4 @@
-"""Which voxels the rays take for their first surface, by a vote of all rays.
+"""The voxels that rays take for their first surface, by a vote of all rays.
 
 For each ray of each keyframe the likeliest first surface is the voxel with the largest (symbols of
 sum_product.py, with the marginals of the whole map as m)

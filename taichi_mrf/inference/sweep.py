@@ -29,7 +29,7 @@ TRACE_BYTES = 20
 
 
 def least_log_odds(free_share: float, clamp: float, prior_log_odds: float) -> float:
-    """How surely free a voxel can be for a keyframe's rays, as log-odds: by ``free_share``, and never beyond
+    """Lower bound on a voxel's log-odds for a keyframe's rays: by ``free_share``, and never beyond
     the ``clamp``."""
     chance = free_share / (1.0 + math.exp(-prior_log_odds))
     return -clamp if chance == 0 else max(-clamp, math.log(chance / (1.0 - chance)))
@@ -187,7 +187,7 @@ class Sweeper:
         )
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
-        """How many voxels of each visible brick moved in the keyframe's last sweep, (n,). The pool adds
+        """Number of voxels of each visible brick that moved in the keyframe's last sweep, (n,). The pool adds
         them to its change counts, which the keyframe keeps. Call it in the order of the sweeps."""
         visible = keyframe.visible
         moved = np.array(on_host(visible.on_device().moved))

@@ -1,4 +1,4 @@
-"""How a keyframe's rays are dealt out to workers: runs of neighbouring rays, which cross the same bricks."""
+"""Division of a keyframe's rays among workers: runs of neighbouring rays, which cross the same bricks."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from taichi_mrf.system.compiler import ti
 
 @dataclass(frozen=True)
 class Workers(Bundle):
-    """How many workers there are, and which rays each takes."""
+    """The number of workers, and the rays that each takes."""
 
     number: I32
     """Workers; each has its own part of the trace."""
@@ -26,7 +26,7 @@ class Workers(Bundle):
 
     @ti.func
     def turns(self, rays: I32):
-        """How many rays each worker is dealt, those beyond the last included."""
+        """Number of rays that each worker is dealt, those beyond the last included."""
         runs = (rays + self.run - 1) // self.run
         return (runs + self.number - 1) // self.number * self.run
 

@@ -62,7 +62,7 @@ class PoseFollower:
 
     @property
     def left(self) -> int:
-        """How many keyframes are still to be moved."""
+        """Number of keyframes still to be moved."""
         return len(self._left)
 
     @property

@@ -19,71 +19,17 @@ import numpy as np
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.pairs import fit_to
 from taichi_mrf.alignment.pose_graph import solve_pose_graph
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
-from taichi_mrf.mapping.tracking import ALIKE, LITTLE_THROUGH, Tracker
+from taichi_mrf.mapping.tracking import Tracker
 
-POINTS = 5000
-"""Points of a keyframe that are aligned, about."""
-
-RECENT = 10
-"""So many keyframes before a new one are no loop."""
-
-STEPS = 3
-"""Recent keyframes that a new one is aligned with."""
-
-STEP_M, STEP_RAD = 0.05, 0.03
-"""Standard deviations of the guess of a step when it is measured."""
-
-TRACKED_M, TRACKED_RAD = 0.15, 0.08
-"""Standard deviations of a tracked step, which count where the two images determine nothing."""
-
-FARTHEST_M = 1.0
-"""A camera that was found again further from the keyframe before has not been tracked from there."""
-
-DRIFT_M, DRIFT = 0.05, 0.03
-"""How far a tracked camera may be off, in metres and as a share of its way since then."""
-
-VIEW_M, VIEW_RAD = 1.0, 1.0
-"""How far two cameras that see the same may stand apart and be turned against each other."""
-
-LOOPS = 3
-"""Older keyframes that a new one is aligned with, at most."""
-
-AROUND = 2
-"""Keyframes before and after an older one whose surface counts with its own."""
-
-CELLS_M = (0.12, 0.5)
-"""Width of the first level's cells of a loop, between these; the drift in between."""
-
-OVERLAP, AGREEMENT = 0.5, 0.6
-"""Shares of the points near the older surface, and of those on it, that a loop needs."""
-
-DISAGREES_M, DISAGREES_RAD = 0.01, 0.005
-"""The graph is solved if a loop is off by more than this."""
-
-TRUSTED = 0.25
-"""Least trust of a loop in the solved graph."""
-
-ALONE_M, CONFIRMED = 0.2, 2
-"""A loop that is off by more than this has to be found from so many keyframes."""
-
-MOST_WAITING = 12
-"""Loops that wait to be confirmed, at most."""
-
-LOSS = 0.1
-"""Log-likelihood of the depth around a loop's ends that closing it may cost. The poses were tracked in this
-very map: right loops that are off by few centimetres cost up to 0.06."""
-
-LEAST_MOTION = 0.02
-"""Voxels by which what a keyframe sees has to move at least, or it stays."""
-
-FREE = PoseConfig(translation_sigma=1e3, rotation_sigma=1e3)
-"""The guesses of a loop count for nothing."""
+FREE = PoseConfig(translation_sigma=RULES.loop_sigma, rotation_sigma=RULES.loop_sigma)
+"""The guesses of a loop."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +53,7 @@ class LoopCloser:
     ) -> None:
         """``fixed`` returns the ids of keyframes that must stay where they are."""
         self._map, self._appearances, self._fixed = tracker.map, tracker.appearances, fixed
-        self._step_config = replace(config, translation_sigma=STEP_M, rotation_sigma=STEP_RAD)
+        self._step_config = replace(config, translation_sigma=RULES.step_m, rotation_sigma=RULES.step_rad)
         self._order: list[int] = []
         self._way_m: dict[int, float] = {}
         self._edges: list[PoseEdge] = []
@@ -148,7 +94,8 @@ class LoopCloser:
         return self._map.keyframes[id].T_world_camera
 
     def _points(self, id: int) -> OrientedPoints:
-        return oriented_points(self._map.keyframes[id].image, self._map.sensor.max_depth).about(POINTS)
+        image = self._map.keyframes[id].image
+        return oriented_points(image, self._map.sensor.max_depth).about(RULES.loop_points)
 
     def _surface(self, ids: Sequence[int]) -> Surfels:
         surface = self._map.aligner.surface
@@ -157,17 +104,17 @@ class LoopCloser:
 
     def _recent(self, id: int) -> list[int]:
         """The keyframe before, and those of the last ones whose views are nearest."""
-        before = self._order[:-1][-RECENT:]
+        before = self._order[:-1][-RULES.recent :]
         nearest = sorted(before[:-1], key=lambda other: sum(tangent_norms(self._pose(id), self._pose(other))))
-        return [*before[-1:], *nearest[: STEPS - 1]]
+        return [*before[-1:], *nearest[: RULES.step_partners - 1]]
 
     def _add_step(self, id: int, near: int, points: OrientedPoints) -> None:
         """Measure the step from a recent keyframe to a new one. The step from the last one counts as tracked
         where their images tell nothing."""
         T_here, T_near = self._pose(id), self._pose(near)
-        tracked = np.diag(np.repeat([TRACKED_M, TRACKED_RAD], 3) ** -2.0)
-        follows = self._order[-2] == near and tangent_norms(T_near, T_here)[1] < FARTHEST_M
-        fit = fit_to(points, self._surface([near]), [T_here], self._step_config, CELLS_M[0])
+        tracked = np.diag(np.repeat([RULES.tracked_m, RULES.tracked_rad], 3) ** -2.0)
+        follows = self._order[-2] == near and tangent_norms(T_near, T_here)[1] < RULES.farthest_step_m
+        fit = fit_to(points, self._surface([near]), [T_here], self._step_config, RULES.loop_cells_m[0])
         if fit is not None and fit.overlap >= self._step_config.min_overlap:
             # Others than the last one have not been tracked from: what the guess says would count twice.
             information = fit.information + tracked if follows else fit.information
@@ -180,67 +127,71 @@ class LoopCloser:
         """Older keyframes that may have seen the same, those that look most alike first. Neighbours of one
         that is chosen tell nothing more."""
         likeness = self._appearances.like(id)
-        alike = [older for older in self._order[: -RECENT - 1] if likeness.get(older, 0.0) > ALIKE]
+        before = self._order[: -RULES.recent - 1]
+        alike = [older for older in before if likeness.get(older, 0.0) > RULES.alike]
         near = [older for older in alike if self._may_see_the_same(id, older)]
         chosen: list[int] = []
         place = {older: n for n, older in enumerate(self._order)}
         for older in sorted(near, key=lambda older: -likeness[older]):
-            if all(abs(place[older] - place[other]) > AROUND for other in chosen):
+            if all(abs(place[older] - place[other]) > RULES.loop_neighbors for other in chosen):
                 chosen.append(older)
-        return chosen[:LOOPS]
+        return chosen[: RULES.loops]
 
     def _may_see_the_same(self, id: int, older: int) -> bool:
         turned, apart_m = tangent_norms(self._pose(older), self._pose(id))
-        return apart_m < VIEW_M + self._drift_m(id, older) and turned < VIEW_RAD
+        return apart_m < RULES.view_m + self._drift_m(id, older) and turned < RULES.view_rad
 
     def _drift_m(self, id: int, older: int) -> float:
-        return DRIFT_M + DRIFT * (self._way_m[id] - self._way_m[older])
+        return RULES.drift_m + RULES.drift * (self._way_m[id] - self._way_m[older])
 
     def _loop(self, id: int, older: int, points: OrientedPoints) -> PoseEdge | None:
         """The step from an older keyframe to a new one, if the new one's image fits there."""
         place = self._order.index(older)
-        surface = self._surface(self._order[max(0, place - AROUND) : place + AROUND + 1])
+        first, last = max(0, place - RULES.loop_neighbors), place + RULES.loop_neighbors
+        surface = self._surface(self._order[first : last + 1])
         T_here, T_there = self._pose(id), self._pose(older)
         turned_there = T_here.copy()
         turned_there[:3, 3] = T_there[:3, 3]
-        cells_m = float(np.clip(self._drift_m(id, older), *CELLS_M))
+        cells_m = float(np.clip(self._drift_m(id, older), *RULES.loop_cells_m))
         fit = fit_to(points, surface, [T_here, T_there, turned_there], FREE, cells_m)
-        if fit is None or fit.directions < 6 or fit.overlap < OVERLAP or fit.agreement < AGREEMENT:
+        if fit is None or fit.directions < 6:
+            return None
+        if fit.overlap < RULES.loop_overlap or fit.agreement < RULES.loop_agreement:
             return None
         image = self._map.keyframes[id].image
-        if looked_through(surface.planes(), image, fit.T_world_camera) > LITTLE_THROUGH:
+        if looked_through(surface.planes(), image, fit.T_world_camera) > RULES.lost_through:
             return None
         return PoseEdge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
 
     def _off(self, edge: PoseEdge) -> tuple[float, float]:
-        """How far an edge disagrees with the poses: metres and radians."""
+        """Disagreement of an edge with the poses: metres and radians."""
         T = inverse(self._pose(edge.first)) @ self._pose(edge.second)
         e = twist(inverse(edge.T_first_second) @ T)
         return float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:]))
 
     def _close(self, loops: Sequence[PoseEdge]) -> Closure | None:
         """Solve the graph with the loops that were found, and move keyframes if they fit better then."""
-        self._waiting = [*self._waiting, *loops][-MOST_WAITING:]
+        self._waiting = [*self._waiting, *loops][-RULES.most_waiting :]
         offs = [self._off(edge) for edge in loops]
-        if not any(m > DISAGREES_M or rad > DISAGREES_RAD for m, rad in offs):
+        if not any(m > RULES.disagrees_m or rad > RULES.disagrees_rad for m, rad in offs):
             return None
         # The poses that fit steps and loops best, and which of the loops these believe.
         stood = {id: self._pose(id) for id in self._order}
         stays = {min(self._order), *self._anchored, *self._fixed()} & stood.keys()
         solution = solve_pose_graph(stood, [*self._edges, *self._waiting], stays)
         trust = solution.trust[len(self._edges) :]
-        believed = [edge for edge, share in zip(self._waiting, trust, strict=True) if share > TRUSTED]
+        believed = [edge for edge, share in zip(self._waiting, trust, strict=True) if share > RULES.trusted]
         if not believed:
             return None
         worst, off = max(((edge, self._off(edge)) for edge in believed), key=lambda each: sum(each[1]))
         # A place may look like another.
-        if off[0] > ALONE_M and len({edge.second for edge in believed}) < CONFIRMED:
+        if off[0] > RULES.alone_m and len({edge.second for edge in believed}) < RULES.confirmed:
             return None
         # Is what the keyframes at both ends have measured about as likely now?
         joined = sorted({id for edge in believed for id in self._around_ends(edge)})
         before = self._log_likelihood(joined)
         moved = self._move(solution.poses)
-        fits = self._log_likelihood(joined) > before - LOSS
+        fits = self._log_likelihood(joined) > before - RULES.loop_loss
         self._waiting = [edge for edge in self._waiting if edge not in believed]
         if not fits:
             self._move(stood)
@@ -262,7 +213,7 @@ class LoopCloser:
         return float(np.nanmean([self._map.depth_log_likelihood(id) for id in ids]))
 
     def _move(self, poses: Mapping[int, Pose]) -> tuple[int, ...]:
-        return self._map.update_poses(poses, least=LEAST_MOTION, tolerance=1.0).moved
+        return self._map.update_poses(poses, least=RULES.least_motion, tolerance=1.0).moved
 
 
 def loop_closer_of(

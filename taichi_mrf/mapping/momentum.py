@@ -12,24 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.gyro import times_within
-
-LONGEST_S = 1.0
-"""Seconds of a step over which accelerations are integrated, at most."""
-
-FIRST_M_S2 = 3.0
-"""Standard deviation of gravity as the mean of the first accelerations: the camera may be moved meanwhile."""
-
-PLACE_M = 0.01
-"""Standard deviation of a place that was found, against the two before it."""
-
-NEAR_M = 0.05
-"""A search from so near finds the place."""
-
-DRIFT_M_S2 = 0.02
-"""By how much gravity and bias together change in a second, as the camera turns."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +37,7 @@ class Momentum:
     def __init__(self) -> None:
         self.gravity_m_s2: NDArray[np.float64] | None = None
         self.proven = False
-        self._variance = FIRST_M_S2**2
+        self._variance = RULES.first_gravity_m_s2**2
         self._said: tuple[Frame, Pose, float] | None = None
         """The frame, its prediction, and by how much that falls short for each m/s^2 of gravity."""
 
@@ -88,9 +74,9 @@ class Momentum:
             return
         _, T_said, lever = self._said
         missed_m = T_now[:3, 3] - T_said[:3, 3]
-        self.proven = bool(np.linalg.norm(missed_m) < NEAR_M)
-        variance = self._variance + DRIFT_M_S2**2
-        share = variance / (variance + (PLACE_M / lever) ** 2)
+        self.proven = bool(np.linalg.norm(missed_m) < RULES.proven_m)
+        variance = self._variance + RULES.gravity_drift_m_s2**2
+        share = variance / (variance + (RULES.found_place_m / lever) ** 2)
         self._variance = (1 - share) * variance
         self.gravity_m_s2 = self.gravity_m_s2 - share / lever * missed_m
 
@@ -99,7 +85,7 @@ def _measured(
     frame: Frame, begin_s: float, T_begin: Pose, end_s: float, bias_rad_s: NDArray[np.float64]
 ) -> _Step | None:
     """A step from a pose, None where samples are missing or it takes too long."""
-    if frame.gyro is None or frame.acceleration is None or not end_s - begin_s <= LONGEST_S:
+    if frame.gyro is None or frame.acceleration is None or not end_s - begin_s <= RULES.longest_integrated_s:
         return None
     samples = frame.acceleration
     times = times_within(samples.stamps_s, begin_s, end_s)

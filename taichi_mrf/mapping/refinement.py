@@ -33,12 +33,12 @@ class PoseChange:
 
     @property
     def translation_m(self) -> float:
-        """How far it was moved."""
+        """Metres by which it was moved."""
         return tangent_norms(self.T_recorded, self.T_refined)[1]
 
     @property
     def rotation_rad(self) -> float:
-        """How far it was turned."""
+        """Radians by which it was turned."""
         return tangent_norms(self.T_recorded, self.T_refined)[0]
 
 

@@ -42,7 +42,7 @@ class RoundStep:
 
 
 class KeyframeMover(Protocol):
-    """How keyframes are moved and swept during the rounds."""
+    """Moves and sweeps keyframes during the rounds."""
 
     def move(self, id: int, T_world_camera: Pose) -> None:
         """Give a keyframe of the map another pose, (4, 4)."""

@@ -1,5 +1,5 @@
-"""Which frames become keyframes: not the held-out ones, and only those taken far enough from other keyframes
-(MRFMap, section V). And which keyframes to freeze when there are too many."""
+"""The frames that become keyframes: not the held-out ones, and only those taken far enough from others
+(MRFMap, section V). And the keyframes to freeze when there are too many."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class KeyframeSelector:
         return sensor not in self._last or self._is_far(self._last[sensor], T_world_camera)
 
     def objection(self, T_world_camera: Pose, measured: bool, sensor: str = "") -> str | None:
-        """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
+        """The reason why a frame with this pose, (4, 4), is no keyframe; None if it is. ``measured``: its
         image holds a measurement, or a missing one that counts (Frame.tells_anything)."""
         if not self.wants(T_world_camera, sensor):
             return "too near to a keyframe"

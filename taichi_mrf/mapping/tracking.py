@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.alignment.appearance import Appearances, Picture, small_picture
 from taichi_mrf.alignment.keyframe_pictures import ColorLevel, KeyframePictures
-from taichi_mrf.alignment.locate import OBSERVABLE_BY_DEPTH, Located, Locator
+from taichi_mrf.alignment.locate import Located, Locator
 from taichi_mrf.alignment.optical_flow import motion_between
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.registry import methods_with
@@ -33,47 +34,15 @@ from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.momentum import Momentum
-from taichi_mrf.mapping.turning import GYRO_RAD, GyroTurns, turned
+from taichi_mrf.mapping.turning import GyroTurns, turned
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera, sees_around
 from taichi_mrf.sensor.frame import Frame
 
-STEPS = KeyframeConfig(rotation=0.2, translation=0.2)
-"""The steps between keyframes if the configuration sets none: if every frame were a keyframe, errors of
-alignment would add up with every frame."""
-
-REACH_M, REACH_RAD = 0.4, 0.4
-"""How far from a guess a frame may be found."""
-
-GUESS_M, GUESS_RAD = 0.03, 0.03
-"""Standard deviations of guesses along and about each axis. Where depth determines a direction badly, the
-pose is a compromise; with 0.1 the camera's way in the built-in room is wrong by 4.6 cm instead of 2.8."""
-
-AROUND_M, AROUND_LOST_M, MOST_AROUND_M = 4.0, 2.0, 10.0
-"""How far from the last place a sensor that sees around is searched for, how much further for each frame that
-was lost, and at most. A lidar that is carried through a building moves by up to 2.3 m in 1.5 s."""
-
-EXPECTED_M = 1.0
-"""Standard deviation of a place that follows from constant motion, for one frame. A walker who stops or turns
-is 1 to 2 m from there after 1.5 s."""
-
-MOST_THROUGH, LITTLE_THROUGH = 0.3, 0.05
-"""Share of what is mapped that a camera's image may look through, and after lost frames: a camera that was
-carried elsewhere fits by chance at a wall, but not without looking through what stood there."""
-
-LONG_LOST, STRICT = 10, (0.8, 0.012)
-"""After so many lost frames: the least share of its points near what is mapped, and the most that its image
-may look through. Images of the room and the kitchen that were taken there have .96 and .011 at worst, those
-of two corridors that fit in the room all the same .47 to .99 and .014 to .045."""
-
-PLACES, ALIKE = 4, 0.5
-"""Keyframes at which a lost camera is searched for, at most, and how much they have to look like its image
-(alignment/appearance.py)."""
-
-LONGEST_AHEAD = 3.0
-"""A motion is continued for this many times as long as it was observed, at most."""
+STEPS = KeyframeConfig(rotation=RULES.keyframe_rad, translation=RULES.keyframe_m)
+"""The steps between keyframes if the configuration sets none."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +106,13 @@ class Tracker:
         self.map = m
         self._config = replace(
             config,
-            translation_sigma=GUESS_M,
-            rotation_sigma=GUESS_RAD,
-            max_translation=REACH_M,
-            max_rotation=REACH_RAD,
+            translation_sigma=RULES.guess_m,
+            rotation_sigma=RULES.guess_rad,
+            max_translation=RULES.reach_m,
+            max_rotation=RULES.reach_rad,
         )
         self._locator = Locator(m.aligner.surface)
-        self._gyro_config = replace(self._config, rotation_sigma=GYRO_RAD)
+        self._gyro_config = replace(self._config, rotation_sigma=RULES.gyro_rad)
         self._turns = GyroTurns()
         self._momentum = Momentum()
         self._pictures = KeyframePictures()
@@ -157,7 +126,7 @@ class Tracker:
 
     @property
     def lost(self) -> int:
-        """How many frames were lost since the last that was not."""
+        """Number of frames lost since the last that was not."""
         return self._lost
 
     def follow(self, frame: Frame) -> tuple[Frame, TrackedFrame]:
@@ -196,11 +165,11 @@ class Tracker:
         return self._found(frame, T_world_camera, located.directions)
 
     def _objection(self, overlap: float, through: float) -> str:
-        """Why a camera is not believed to be where its image fits, with these shares near what is mapped and
+        """Reason to doubt that a camera is where its image fits, with these shares near what is mapped and
         looking through it; empty if it is. The longer it was lost, the further it may be from there."""
-        least, most = (
-            STRICT if self._lost > LONG_LOST else (0.0, LITTLE_THROUGH if self._lost else MOST_THROUGH)
-        )
+        least, most = 0.0, RULES.lost_through if self._lost else RULES.most_through
+        if self._lost > RULES.long_lost:
+            least, most = RULES.strict_overlap, RULES.strict_through
         if through > most:
             return f"it would look through {100 * through:.1f}% of what is mapped"
         if overlap < least:
@@ -256,18 +225,18 @@ class Tracker:
         if self._last is None or self._before is None:
             return None
         ahead = _ratio(stamp - self._last.stamp, self._last.stamp - self._before.stamp)
-        return ahead if ahead <= LONGEST_AHEAD else None
+        return ahead if ahead <= RULES.longest_ahead else None
 
     def _around(self, camera: Camera, stamp: float) -> Around:
         """Space in which a sensor that sees around may be by now."""
         assert self._last is not None
-        reach_m = min(AROUND_M + AROUND_LOST_M * self._lost, MOST_AROUND_M)
+        reach_m = min(RULES.around_m + RULES.around_lost_m * self._lost, RULES.most_around_m)
         T_last = self._pose(self._last)
         expected_m = T_last[:3, 3]
         ahead = self._ahead(stamp)
         if self._before is not None and ahead is not None:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
-        return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
+        return Around(T_last, camera.up, reach_m, expected_m, RULES.expected_m * (1 + self._lost))
 
     def _guesses(self, frame: Frame) -> list[Pose]:
         """Poses of the camera if it stands still, by its accelerometer, and if it moves on, which is left out
@@ -299,7 +268,7 @@ class Tracker:
         guess = [self._pose(self._last) @ motion]
         keyframes = self.map.keyframes
         return self._locator.locate(
-            image, guess, keyframes, config, colors=colors, observable=OBSERVABLE_BY_DEPTH
+            image, guess, keyframes, config, colors=colors, observable=RULES.observable_by_depth
         )
 
     def _carried(self, frame: Frame) -> list[Pose]:
@@ -314,14 +283,14 @@ class Tracker:
         """Poses of a lost camera: where it began, and where keyframes look like its picture."""
         keyframes = self.map.keyframes
         likeness = self.appearances.likeness(picture)
-        known = [id for id, how in likeness.items() if how > ALIKE and id in keyframes]
-        best = sorted(known, key=lambda id: -likeness[id])[:PLACES]
+        known = [id for id, how in likeness.items() if how > RULES.alike and id in keyframes]
+        best = sorted(known, key=lambda id: -likeness[id])[: RULES.known_places]
         first = [] if self._first is None else [self._pose(self._first)]
         return [*first, *(keyframes[id].T_world_camera for id in best)]
 
 
 def _ratio(ahead: float, observed: float) -> float:
-    """How much longer the one time is than the other; 1 where stamps do not tell."""
+    """Ratio of two times; 1 where stamps do not tell."""
     told = math.isfinite(ahead) and math.isfinite(observed) and ahead > 0 and observed > 0
     return ahead / observed if told else 1.0
 

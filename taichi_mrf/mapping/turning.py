@@ -1,22 +1,14 @@
-"""How a tracked camera has turned since its last frame, by its gyroscope, whose bias is learnt on the way."""
+"""Turn of a tracked camera since its last frame, by its gyroscope, whose bias is learnt on the way."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
-
-GYRO_RAD = 0.005
-"""Standard deviation of a turn by the gyroscope, about each axis."""
-
-SHARE = 0.1
-"""Share by which the bias follows what each frame says, once there have been 1 / SHARE of them."""
-
-LARGEST_BIAS_RAD_S = 0.1
-"""A frame that differs from the gyroscope by more says nothing about the bias."""
 
 
 class GyroTurns:
@@ -40,9 +32,9 @@ class GyroTurns:
         beyond = np.eye(4)
         beyond[:3, :3] = T_now[:3, :3].T @ T_before[:3, :3] @ R
         rate = twist(beyond)[3:] / (frame.stamp - stamp)
-        if np.abs(rate).max() < LARGEST_BIAS_RAD_S:
+        if np.abs(rate).max() < RULES.largest_bias_rad_s:
             self._noted += 1
-            self.bias_rad_s = self.bias_rad_s + max(SHARE, 1 / self._noted) * rate
+            self.bias_rad_s = self.bias_rad_s + max(RULES.gyro_share, 1 / self._noted) * rate
 
 
 def turned(guesses: Sequence[Pose], T_before: Pose, R_before_now: NDArray[np.float64] | None) -> list[Pose]:

@@ -107,7 +107,7 @@ def _through_space(
 
 
 def _may_end_rays(m: VoxelMap, slots: NDArray[np.int32], rays: int) -> NDArray[np.bool_]:
-    """Which of some bricks (n,) hold an occupied voxel: the others are passed in one step. Where rays are
+    """True for the bricks (n,) with an occupied voxel: the others are passed in one step. Where rays are
     few, looking would cost more than it saves, and it is all of them."""
     marks = np.ones(len(slots), np.int32)
     if rays >= RAYS_A_BRICK * len(slots):

@@ -17,7 +17,7 @@ STATES = ("unknown", "free", "occupied")
 
 @dataclass(frozen=True)
 class MapChange:
-    """How map b differs from map a.
+    """Differences of map b from map a.
 
     ``counts`` (3, 3) int64 is the number of voxels by state in a (row) and in b (column): UNKNOWN, FREE,
     OCCUPIED, without those that are unknown in both. ``mean_difference`` is the mean of |p_b - p_a| over the

@@ -67,7 +67,7 @@ class Surfaces:
         return self._slots[rows_around(bricks, self._keys, self._reach)]
 
     def clear(self, voxels: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Which voxels, coordinates (n, 3), have no surface within the slack, (n,)."""
+        """True for the voxels, coordinates (n, 3), that have no surface within the slack, (n,)."""
         bricks, owner = np.unique(voxels // BRICK, axis=0, return_inverse=True)
         clear = np.ones(len(voxels), np.bool_)
         order = np.argsort(owner.reshape(-1), kind="stable")
@@ -100,7 +100,7 @@ class Surfaces:
 
 
 def stands_clear(voxels: NDArray[np.int32], surfaces: Surfaces, core: int = CORE_VOXELS) -> NDArray[np.bool_]:
-    """Which voxels, coordinates (n, 3), are of a cluster of which at least ``core`` are clear of the
+    """True for the voxels, coordinates (n, 3), of a cluster of which at least ``core`` are clear of the
     surfaces, (n,)."""
     cells, cell = np.unique(voxels // CELL_VOXELS, axis=0, return_inverse=True)
     cluster = find_clusters(cells)[0][cell.reshape(-1)]

@@ -1,4 +1,4 @@
-"""How much a depth image contradicts a map, ray by ray, and which way: something new stands in known-free
+"""Contradiction of a depth image and a map, ray by ray, and its sign: something new stands in known-free
 space, or a known surface is gone.
 
 With z a measurement and Omega_i the probability that its ray's first surface lies in voxel i (MRFMap,
@@ -37,7 +37,7 @@ def ray_scores(
     camera: Camera,
     own: OwnEvidence = NOTHING,
 ) -> NDArray[np.float32]:
-    """How much each pixel of a depth image contradicts a map, (H, W) float32, in nats (natural logarithms of
+    """Contradiction of each pixel of a depth image to a map, (H, W) float32, in nats (natural logarithms of
     likelihood ratios).
 
     ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;

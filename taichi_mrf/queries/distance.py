@@ -1,4 +1,4 @@
-"""How far it is to the nearest obstacle, and which way leads away from it: what planners ask.
+"""The distance to the nearest obstacle, and the way that leads away from it: what planners ask.
 
 The distances are exact at the centres of voxels and linear between them along each axis, so that the
 gradient is that of what is returned. They are cut off at a stated distance, which bounds what a change of the
@@ -293,7 +293,7 @@ class DistanceField(Owned):
 
     @tensors.in_kind("centres", "radii_m", on_device=True)
     def clearance(self, centres: ArrayLike, radii_m: ArrayLike) -> NDArray[np.float32]:
-        """How far bodies made of balls are from obstacles: centres (C, S, 3) of S balls for each of C bodies
+        """Distance of bodies made of balls from obstacles: centres (C, S, 3) of S balls for each of C bodies
         or configurations, in metres, and their radii (S,) -> (C,) float32, the least distance of a centre
         less its radius. It is positive if no ball reaches an obstacle, and NaN if the distance of one is not
         known.

@@ -55,7 +55,7 @@ class SpaceRules:
 
     @property
     def reach_bricks(self) -> int:
-        """How many bricks away a state can change a distance."""
+        """Bricks up to which a state can change a distance."""
         return -(-self.reach // BRICK)
 
     @property
@@ -114,7 +114,7 @@ class FieldGrid(Bundle):
     """The entry of ``classes`` for a column in unknown space."""
 
     reach: I32
-    """How many voxels a minimum looks to either side."""
+    """Voxels to either side among which a minimum is taken."""
 
     outside: I32
     """The squared distance in unknown space, -(reach + 1)^2 where that is an obstacle."""

@@ -28,7 +28,7 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, withi
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 NEAR_VOXELS, NEAR_M = 1.5, 0.075
-"""How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the
+"""Distance, along the surface's normal, at which the likeliest voxel of a ray and its surface still are the
 same. In metres too, since a sensor's errors move the likeliest of small voxels; along the normal, because
 rays that graze a surface run along it."""
 

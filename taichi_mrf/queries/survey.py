@@ -25,8 +25,8 @@ from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, 
 
 @dataclass(frozen=True)
 class Occlusion(Bundle):
-    """Which voxels let every ray through, and how sure a view is of the others, by their log-odds of being
-    occupied."""
+    """The voxels that let every ray through, and how sure a view is of the others, by their log-odds of
+    being occupied."""
 
     unknown: F32 = FAR
     """Log-odds that stand for "never seen" in maps that mark it so."""
@@ -104,7 +104,7 @@ class SurfaceSurvey:
 
 @dataclass(frozen=True)
 class Medium(Bundle):
-    """How a survey reads the map (View)."""
+    """A survey's way of reading the map (View)."""
 
     voxel_size: F32
     """Metres."""
@@ -116,7 +116,7 @@ class Medium(Bundle):
     """Log-odds above which a voxel can be the surface."""
 
     occlusion: Occlusion
-    """How voxels dim rays."""
+    """The voxels that let rays through, and the way others dim them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How likely something lies in a ball, or in the way of a ball that moves: voxels taken together.
+"""Probability that something lies in a ball, or in the way of a ball that moves: voxels taken together.
 
 A ray has one first surface. Where its depth is uncertain the voxels along the ray share it, so along a line
 the chances of voxels with evidence of a surface add up; voxels without it are independent. Lines side by side

@@ -20,7 +20,7 @@ def largest_turn(directions: NDArray[np.float64]) -> float:
 
 
 def cone_span(half_angle: float) -> int | None:
-    """How many cells along each side a cone of ``half_angle`` radians can touch at most, for
+    """Most cells along each side that a cone of ``half_angle`` radians can touch, for
     :func:`most_in_span`; None if that may be all.
 
     The directions in a cone lie in a ball around its axis' end on the unit sphere, hence in a cube, and hence
@@ -61,5 +61,5 @@ def morton_order(units: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def _in_steps(units: NDArray[np.float64], steps: int) -> NDArray[np.int64]:
-    """Which of so many steps from -1 to 1 each component lies in."""
+    """The one of so many steps from -1 to 1 that each component lies in."""
     return np.clip(np.floor((units + 1.0) * (steps / 2)), 0, steps - 1).astype(np.int64)

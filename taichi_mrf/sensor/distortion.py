@@ -12,7 +12,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
 
 _COEFFICIENTS = (4, 5, 8, 12, 14)
-"""How many OpenCV takes."""
+"""Numbers of coefficients that OpenCV takes."""
 
 _STEPS = 200
 """Most steps of the iteration that undistorts."""

@@ -10,7 +10,7 @@ from taichi_mrf.kernels.types import F32, Template
 from taichi_mrf.system.compiler import ti
 
 AUTO, SEGMENT, CENTRE = 0, 1, 2
-"""How a segment of the ray stands for its surface: see InferenceConfig.likelihood."""
+"""The point or average of a segment that stands for its surface: see InferenceConfig.likelihood."""
 
 SUPPORT = 6.5
 """Sigmas beyond which a measurement is impossible: a density of 3e-10 / sigma, far below any floor."""
@@ -20,7 +20,7 @@ NORMALISER = 0.3989422804014327  # 1 / sqrt(2 pi)
 
 @ti.func
 def deviation(measured: F32, depth: F32, noise: Template) -> F32:
-    """How many sigma the measurement lies beyond what a surface at ``depth`` would give on average."""
+    """Sigmas by which the measurement lies beyond what a surface at ``depth`` would give on average."""
     return (measured - depth - noise.bias(depth)) / noise.sigma(depth)
 
 

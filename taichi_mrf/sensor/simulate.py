@@ -26,7 +26,7 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """How measured depth departs from true depth. All depths are axial, in metres."""
+    """Departure of measured depth from true depth. All depths are axial, in metres."""
 
     sigma: tuple[float, ...] = (0.001504, -0.00152, 0.0019)
     """Standard deviation as a polynomial in true depth, ascending powers. The default is the Kinect 1

@@ -19,7 +19,7 @@ Sums = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Weights, and distances and excesses times weight."""
 
 VALUES = LAYERS[SURFACE].width
-"""How many sums a voxel has."""
+"""Number of sums of a voxel."""
 
 BLENDED_BELOW = 0.3
 """t: the weight at which a voxel's mean distance has a standard deviation of about half a voxel."""

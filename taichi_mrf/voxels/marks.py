@@ -60,7 +60,7 @@ def voxel_in_window(cell: IVec3, shape: IVec3) -> I32:
 
 
 def count(marks: Marks) -> int:
-    """How many voxels are marked."""
+    """Number of voxels that are marked."""
     return sum(int(np.unpackbits(part.view(np.uint8)).sum()) for part in np.array_split(marks, _parts(marks)))
 
 

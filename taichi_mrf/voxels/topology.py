@@ -1,4 +1,4 @@
-"""Which bricks exist: the map's index from brick coordinates to slots in the pool.
+"""The bricks that exist: the map's index from brick coordinates to slots in the pool.
 
 On CPU and CUDA it is a layer of a Taichi SNode tree, pointer -> pointer -> pointer -> bitmasked: a bitmasked
 cell is a brick, the pointer cell above it a chunk of 8^3 bricks, the one above that a region of 16^3 chunks,
@@ -52,7 +52,7 @@ class Topology(Protocol):
         """Count ``number`` (+1 or -1) keyframes more that see through each brick."""
 
     def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
-        """How many keyframes see through each brick."""
+        """Number of keyframes that see through each brick."""
 
     def locate(self, points: Any, voxel_size: float, voxels: Any) -> None:
         """Write to ``voxels`` (N) int32 where in the pool the voxel of each of some points is, (N, 3) float32

@@ -7,6 +7,7 @@ from taichi_mrf.alignment import locate
 from taichi_mrf.alignment.levenberg import Aligned
 from taichi_mrf.alignment.point_to_plane import NormalEquations
 from taichi_mrf.alignment.recorded import Recorded
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
@@ -31,9 +32,9 @@ def test_badly_determined_directions_count_where_they_change_little(
     equations = NormalEquations(np.eye(6), np.zeros(6), 1.0, 0.0, 1, 1, 0.0)
 
     def ended(levels: object, T: Pose, prior: object, lever_m: float, observable: float) -> Aligned:
-        step = all_m if observable < locate.OBSERVABLE_BY_DEPTH else well_m
+        step = all_m if observable < RULES.observable_by_depth else well_m
         return Aligned(moved(T, [*step, 0.0, 0.0, 0.0]), equations, 6)
 
     monkeypatch.setattr(locate, "aligned", ended)
-    end = locate._not_carried_away([], GUESS, Recorded(GUESS, PoseConfig()), 1.0, locate.OBSERVABLE)
+    end = locate._not_carried_away([], GUESS, Recorded(GUESS, PoseConfig()), 1.0, RULES.observable)
     assert tangent_norms(end.T_world_camera, moved(GUESS, [*taken_m, 0.0, 0.0, 0.0]))[1] < 1e-9

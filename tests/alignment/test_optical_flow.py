@@ -7,9 +7,9 @@ import pytest
 from patterned_wall import AHEAD, CAMERA, wall
 
 from taichi_mrf.alignment.optical_flow import motion_between
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.geometry.poses import inverse
-from taichi_mrf.mapping.tracking import GUESS_M
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from taichi_mrf.mapping.tracking import GUESS_M
         ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.005),
         ((0.15, 0.0, 0.0, 0.0, 0.0, 0.0), 0.005),  # 13 pixels
         ((0.05, -0.08, 0.1, 0.04, -0.1, 0.05), 0.005),
-        ((0.0, 0.0, 0.0, 0.0, 0.25, 0.0), GUESS_M / 2),  # 35 pixels, of which few corners are left
+        ((0.0, 0.0, 0.0, 0.0, 0.25, 0.0), RULES.guess_m / 2),  # 35 pixels, of which few corners are left
     ],
 )
 def test_the_motion_is_that_of_the_camera(xi: tuple[float, ...], near: float) -> None:

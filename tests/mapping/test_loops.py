@@ -7,6 +7,7 @@ import pytest
 from tracked_room import CONFIG, errors, nowhere, walk
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Planes
@@ -16,7 +17,7 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.mapping.loops import TRACKED_M, Closure, LoopCloser
+from taichi_mrf.mapping.loops import Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.tracking import Tracker
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -101,8 +102,8 @@ def test_where_images_tell_nothing_a_step_counts_as_tracked_once() -> None:
     across = {(edge.first, edge.second): edge.information[0, 0] for edge in loops._edges}
     assert across.keys() == {(0, 1), (1, 2), (0, 2)}
     for step in ((0, 1), (1, 2)):
-        assert across[step] == pytest.approx(TRACKED_M**-2, rel=0.3)
-    assert across[0, 2] < 0.1 * TRACKED_M**-2
+        assert across[step] == pytest.approx(RULES.tracked_m**-2, rel=0.3)
+    assert across[0, 2] < 0.1 * RULES.tracked_m**-2
 
 
 def test_a_loop_that_is_not_believed_says_nothing_of_how_far_the_camera_was_off(
