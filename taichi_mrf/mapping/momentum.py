@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import times_within
+from taichi_mrf.sensor.motion import times_within
 
 LONGEST_S = 1.0
 """Seconds of a step over which accelerations are integrated, at most."""
