@@ -153,7 +153,7 @@ def kernels(options: Options) -> dict[str, Any]:
 def wall(options: Options) -> dict[str, Any]:
     """Wall time of a keyframe with three sweeps, and of full inference at the finest voxel size."""
     from taichi_mrf.benchmark.keyframe_cost import Seconds, live_stages, timed, warm_up
-    from taichi_mrf.benchmark.launches import count_launches
+    from taichi_mrf.benchmark.profile import count_launches
     from taichi_mrf.config.schema import Config
     from taichi_mrf.methods.mrf.map import MRFMap
 

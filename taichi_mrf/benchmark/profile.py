@@ -1,16 +1,27 @@
-"""Profile of a new keyframe: every kernel by Taichi's own profiler, and the host by Python's.
+"""Profile of a new keyframe: every kernel by Taichi's own profiler, the host by Python's, and the least that
+each kernel must read and write.
 
 Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
-so many kernels, launches are timed instead (launches.py), which has a launch's own cost in it. Profiling
-slows the host down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
+so many kernels, launches are timed instead, which has a launch's own cost in it. Profiling slows the host
+down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
+
+The bytes of a kernel, divided by the memory's bandwidth, are a floor under its time: nothing that computes
+the same can be faster, unless its data are still in a cache. Every array is counted once, however often it is
+touched.
+
+Launches are watched from outside: how often the host waits for the device, and how long each takes. On a
+device with a memory of its own, the launch of a kernel that is handed a NumPy array waits until that has been
+copied there and back; reading an array back is such a launch too. On a CPU no copy is needed.
 """
 
 import cProfile
 import pstats
 import re
+import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +29,112 @@ import numpy as np
 
 import taichi_mrf
 from taichi_mrf import Config, Frame, MRFMap
-from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
-from taichi_mrf.benchmark.launches import count_launches
+from taichi_mrf.inference.sweep import TRACE_BYTES
 from taichi_mrf.kernels import quick_start
 from taichi_mrf.system import compiler, runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.layout import VOXELS
+
+Floor = Callable[["Work"], float]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Work of a keyframe for its kernels.
+
+    ``crossed``, ``surface``, ``created`` and ``visible`` are bricks (see inference/keyframe.py); ``met`` are
+    the voxels that get a message, ``voxel_steps`` those crossed, each ray's counted. ``message_bytes`` are
+    those of one message. ``trace_in_cache``: whether a ray's steps never reach the memory.
+    """
+
+    pixels: float
+    rays: float
+    crossed: float
+    surface: float
+    created: float
+    visible: float
+    met: float
+    voxel_steps: float
+    message_bytes: float
+    trace_in_cache: bool
+
+    @property
+    def voxels(self) -> float:
+        """Voxels of the visible bricks."""
+        return self.visible * VOXELS
+
+    @property
+    def trace_bytes(self) -> float:
+        """Bytes of the trace, written once and read once."""
+        return 0.0 if self.trace_in_cache else 2 * TRACE_BYTES * self.voxel_steps
+
+
+FLOORS: Mapping[str, Mapping[str, Floor]] = {
+    "allocate": {
+        "ext_arr_to_ndarray": lambda w: 8 * w.pixels,  # the depth image, to the device
+        "_choose": lambda w: 20 * w.pixels,  # depth in; nearest, farthest, mean, level out
+        "_write_down": lambda w: 4 * w.pixels + 12 * w.rays,  # levels and means in, the list out
+        "_mark": lambda w: 8 * w.rays + 4 * w.crossed,  # the list in, marks out
+        "read": lambda w: 20 * (w.surface + w.crossed),  # coordinates and the tree in, slots out
+        "fill_bricks": lambda w: (4 + 4 * VOXELS) * w.created,
+        "write": lambda w: 20 * w.created,  # coordinates and slots in, the tree out
+        "count": lambda w: 20 * w.crossed,  # coordinates in, the tree in and out
+    },
+    "own_sweep": {
+        "_clear": lambda w: w.message_bytes * w.voxels,  # new messages
+        "cavity": lambda w: (
+            (4 + w.message_bytes + 4 + 8) * w.voxels
+        ),  # belief, message in; log_free, sums out
+        "_enter": lambda w: 12 * w.visible,  # cells and their order in, index out
+        "_take_out": lambda w: 8 * w.visible,  # cells in, index out
+        "send_messages": lambda w: 12 * w.rays + (4 + 8 + 8) * w.met + w.trace_bytes,
+        "finish": lambda w: 8 * w.voxels + (2 * w.message_bytes + 8) * w.met,
+        "ndarray_to_ext_arr": lambda w: 8 * w.visible,  # how many moved
+    },
+}
+"""By stage and by the kernel's name."""
+
+COPIES = ("ext_arr_to_ndarray", "ndarray_to_ext_arr")
+"""Those that bring arrays to the device and back: there are none on a CPU (kernels/resident.py)."""
+
+
+@dataclass
+class Launches:
+    """``number`` of launches, and those that the host has to ``wait`` for, because a NumPy array goes in or
+    comes out; ``seconds`` of each launch by the kernel's name, if they are timed."""
+
+    number: int = 0
+    waits: int = 0
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+
+@contextmanager
+def count_launches(timed: bool = False) -> Iterator[Launches]:
+    """Watch all launches while the block runs. ``timed`` waits for each kernel, so as to time it."""
+    launches = Launches()
+    kernels = compiler.kernel_class()
+    launch = kernels.launch_kernel
+    apart = runtime.active() != "cpu"
+
+    def watched(self: Any, *arguments: Any, **named: Any) -> Any:
+        launches.number += 1
+        launches.waits += apart and any(isinstance(argument, np.ndarray) for argument in arguments)
+        if not timed:
+            return launch(self, *arguments, **named)
+        ti.sync()
+        begin = time.perf_counter()
+        result = launch(self, *arguments, **named)
+        ti.sync()
+        launches.seconds[self.func.__name__].append(time.perf_counter() - begin)
+        return result
+
+    kernels.launch_kernel = watched
+    try:
+        yield launches
+    finally:
+        kernels.launch_kernel = launch
+
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)

@@ -21,8 +21,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import chosen
 from taichi_mrf.datasets.recorded_noise import LONG_RAY
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.evaluation.noise_check import checked, explained_frame
-from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, checked, explained_frame, pooled
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.result import MappingResult
 

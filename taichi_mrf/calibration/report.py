@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.coverage import Coverage
-from taichi_mrf.calibration.fit import NEIGHBOURS, LearntNoise
-from taichi_mrf.calibration.frustum_picture import frustum_picture
-from taichi_mrf.calibration.learning import Calibration
+from taichi_mrf.calibration.fit import NEIGHBOURS, Calibration, LearntNoise
 from taichi_mrf.calibration.no_return import NoReturnFit
-from taichi_mrf.calibration.noise_pictures import central_third, curves_picture, maps_picture
+from taichi_mrf.calibration.noise_pictures import central_third, curves_picture, frustum_picture, maps_picture
 from taichi_mrf.system.atomic import atomic_path, write_npz, write_text
 
 if TYPE_CHECKING:

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from taichi_mrf.calibration import board_images, depth_files
-from taichi_mrf.calibration.board_images import FoundBoards, find_boards, image_files
-from taichi_mrf.calibration.depth_files import DepthFiles
-from taichi_mrf.calibration.motion_capture import align
+from taichi_mrf.calibration import chessboard, pairs
+from taichi_mrf.calibration.chessboard import FoundBoards, find_boards, image_files
+from taichi_mrf.calibration.motion_capture import BodyPair, align
 from taichi_mrf.calibration.options import CalibrationConfig
-from taichi_mrf.calibration.pairs import BoardPairs, PairSource, RecordedPairs
-from taichi_mrf.calibration.time_lag import BodyPair
+from taichi_mrf.calibration.pairs import BoardPairs, DepthFiles, PairSource, RecordedPairs
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -22,7 +20,7 @@ from taichi_mrf.system.files import read_text
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
 
-SUFFIXES = (*board_images.FORMATS, *depth_files.FORMATS)
+SUFFIXES = (*chessboard.FORMATS, *pairs.FORMATS)
 """Ends of a file's name that are no part of the image's."""
 
 

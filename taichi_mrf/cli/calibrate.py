@@ -7,9 +7,9 @@ from typing import Any
 from rich.table import Table
 
 from taichi_mrf.calibration.coverage import Coverage
-from taichi_mrf.calibration.depth_files import DepthFiles
-from taichi_mrf.calibration.learning import calibrate
+from taichi_mrf.calibration.fit import calibrate
 from taichi_mrf.calibration.no_return import learn_no_return
+from taichi_mrf.calibration.pairs import DepthFiles
 from taichi_mrf.calibration.report import (
     CONFIG_FILE,
     calibration_report,

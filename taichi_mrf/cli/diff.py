@@ -9,8 +9,8 @@ from rich.table import Table
 from taichi_mrf.cli.options.saved_maps import Diff
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.changes import write_changes
 from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.export.ply import write_changes
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import MapPart, in_chunks, take_part
 from taichi_mrf.methods.protocol import OccupancyMap

@@ -24,14 +24,15 @@ from taichi_mrf.datasets.laser.plan_image import FloorPlan, read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.evaluation.laser.floor_plan_frame import Registration, register
-from taichi_mrf.evaluation.laser.floor_plan_scores import (
+from taichi_mrf.evaluation.floor_plan import (
     CellScores,
     FloorPlanScores,
+    LaserMap,
+    Registration,
     floor_plan_scores,
+    register,
     true_cells,
 )
-from taichi_mrf.evaluation.laser.laser_map import LaserMap
 from taichi_mrf.evaluation.pictures.laser_pictures import (
     comparison_figure,
     energy_figure,

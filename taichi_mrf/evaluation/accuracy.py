@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError, FrameError
-from taichi_mrf.evaluation.depth_error import DepthError, depth_error
+from taichi_mrf.evaluation.held_out import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import Answer, View

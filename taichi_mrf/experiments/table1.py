@@ -6,8 +6,7 @@ from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import mrf, standard_contenders
 from taichi_mrf.experiments.folds import Experiment, Scored, leave_one_out, require_views
 from taichi_mrf.experiments.scenes import coffin_scene
-from taichi_mrf.experiments.score_tables import score_table
-from taichi_mrf.experiments.tuning import GRID, tuned_leave_one_out
+from taichi_mrf.experiments.tuning import GRID, score_table, tuned_leave_one_out
 
 PAPER = {
     ("MRFMap, omega", 0.01): Spread(0.870, 0.011),

@@ -18,8 +18,7 @@ from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, 
 from taichi_mrf.experiments.judging import build, judge_all
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, house_scene, keyframes_of
-from taichi_mrf.experiments.score_tables import score_table
-from taichi_mrf.experiments.tuning import tuned_contender
+from taichi_mrf.experiments.tuning import score_table, tuned_contender
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.atomic import atomic_path
 

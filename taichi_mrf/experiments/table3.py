@@ -9,8 +9,7 @@ from taichi_mrf.experiments.contenders import standard_contenders
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build_and_judge
 from taichi_mrf.experiments.scenes import Scene, kitchen_scene
-from taichi_mrf.experiments.score_tables import score_table
-from taichi_mrf.experiments.tuning import tuned_contender
+from taichi_mrf.experiments.tuning import score_table, tuned_contender
 
 PAPER = {
     ("MRFMap, omega", 0.01): Spread(0.305, 0.185),

@@ -1,11 +1,15 @@
 """A map as a chunked array on disk, in zarr 3, for maps that are larger than memory.
 
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
-voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3)
-int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
-The other layers that the map has (voxels/layers.py) are arrays (x, y, z, width) of their own, 0 for nothing.
-The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
-corner of the array's first voxel.
+voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3) int32 lists
+the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1. The other
+layers that the map has (voxels/layers.py) are arrays (x, y, z, width) of their own, 0 for nothing. The
+attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer corner of the array's first
+voxel.
+
+A store can grow during a run, and be read at any moment. Each file is written in a folder beside the store
+and moved into place: a chunk's file first, then the list that names it. A run that is killed in between
+leaves the old chunk or the new one, and no chunk on the list without its file.
 """
 
 import os
@@ -67,7 +71,7 @@ class ChunkStore:
         layers: Sequence[str] = (),
     ) -> "ChunkStore":
         """An empty store for some chunks, (n, 3), which the caller then writes. Its array covers their
-        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``. ``layers`` beside
+        bounding box; if it ``grows``, all chunks within ``FARTHEST``. ``layers`` beside
         log-odds get arrays too.
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
@@ -140,7 +144,7 @@ class ChunkStore:
 
     @property
     def grows(self) -> bool:
-        """True if chunks can be added to it (growing_store.py)."""
+        """True if chunks can be added to it."""
         return self._layout.lowest_chunk == (-FARTHEST,) * 3
 
     def file_of(self, name: str, chunk: Sequence[int]) -> Path:
@@ -220,3 +224,57 @@ def new_store(path: str | Path) -> Iterator[Path]:
 def _is_store(path: Path) -> bool:
     header = path / "zarr.json"
     return is_file(header) and FORMAT_KEY in read_text(header, MapFileError)
+
+
+_DOCUMENT = "zarr.json"
+
+
+def put_chunks(path: Path, header: StoreHeader, put: NDArray[np.int32], layers: Layers) -> None:
+    """Write the layers of some chunks ``put`` (n, 3) into the store ``path``, which is made if it does not
+    exist; of chunks that are there already the named layers are replaced. Raises MapFileError, also for a
+    store that was not made here, and TaichiMRFError without zarr."""
+    new = put.reshape(-1, 3)
+    if len(new) and max(-int(new.min()), int(new.max()) + 1) > FARTHEST:
+        raise MapFileError(f"{path}: a chunk further than {FARTHEST} chunks from the origin has no place")
+    grown = exists(path)
+    listed = _listed(path) if grown else new[:0]
+    known = set(map(tuple, listed.tolist()))
+    added = [chunk for chunk in new.tolist() if tuple(chunk) not in known]
+    chunks = np.concatenate([listed, np.array(added, np.int32).reshape(-1, 3)])
+    staging = temporary_name(path)
+    try:
+        others = tuple(name for name in layers if name != LOG_ODDS)
+        stage = ChunkStore.create(staging, header, chunks, grows=True, layers=others)
+        stage.write(layers)
+        if not grown:
+            os.replace(staging, path)
+            return
+        for name in (*others, LOG_ODDS):
+            if name != LOG_ODDS:
+                _move(staging, path, Path(name, _DOCUMENT))
+            for chunk in new.tolist():
+                _move(staging, path, stage.file_of(name, chunk))
+        if added:
+            for file in sorted((staging / CHUNKS / "c").glob("*/0")):
+                _move(staging, path, file.relative_to(staging))
+            _move(staging, path, Path(CHUNKS, _DOCUMENT))
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _listed(path: Path) -> NDArray[np.int32]:
+    store = ChunkStore.open(path)
+    if not store.grows:
+        raise MapFileError(f"{path}: its array is as large as its map: no chunk can be added to it")
+    return store.chunks
+
+
+def _move(staging: Path, path: Path, file: Path) -> None:
+    """Move a file of the staged store to its place. zarr writes none for a chunk without known voxels."""
+    if (staging / file).exists():
+        (path / file).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(staging / file, path / file)
+    else:
+        (path / file).unlink(missing_ok=True)

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.octomap import BINARY_HEADER, FULL_HEADER
-from taichi_mrf.export.octree import (
+from taichi_mrf.export.octomap import (
+    BINARY_HEADER,
     BRICK_LEVEL,
     DEPTH,
+    FULL_HEADER,
     INNER,
     NO_CHILD,
     OCCUPIED_LEAF,

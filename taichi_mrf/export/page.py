@@ -17,8 +17,7 @@ from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import probabilities, voxel_colors
-from taichi_mrf.viewer.scene.options import ColorBy, ViewOptions
+from taichi_mrf.viewer.scene.coloring import ColorBy, ViewOptions, probabilities, voxel_colors
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, look_of
 from taichi_mrf.viewer.scene.voxel_store import Chunk, Shown, VoxelStore, facing

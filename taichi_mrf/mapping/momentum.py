@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import times_within
+from taichi_mrf.sensor.motion import times_within
 
 
 @dataclass(frozen=True)

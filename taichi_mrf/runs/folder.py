@@ -17,7 +17,7 @@ from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out
-from taichi_mrf.evaluation.noise_check import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
+from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions

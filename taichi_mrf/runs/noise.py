@@ -9,8 +9,7 @@ import yaml
 
 from taichi_mrf.calibration.from_recording import NOISE, LearntSigma
 from taichi_mrf.config.schema import SensorConfig
-from taichi_mrf.evaluation.noise_check import NoiseCheck
-from taichi_mrf.evaluation.noise_fit import SigmaLaw
+from taichi_mrf.evaluation.noise_fit import NoiseCheck, SigmaLaw
 
 NO_NOISE = 8.0
 """No sensor's noise differs from a stated one by so large a factor: what is wrong is something else."""

@@ -15,8 +15,7 @@ from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
 
 if TYPE_CHECKING:
-    from taichi_mrf.sensor.acceleration import AccelerationSamples
-    from taichi_mrf.sensor.gyro import GyroSamples
+    from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
     from taichi_mrf.sensor.noise import NoiseModel
 
 

@@ -18,10 +18,9 @@ from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config, without_window
 from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.evaluation.pictures.overview import LIGHT, PERSPECTIVE, height_span
-from taichi_mrf.evaluation.pictures.surface_view import PHOTO_VOXEL_M, DrawnSurface, smooth_borders
+from taichi_mrf.evaluation.pictures.room_views import PHOTO_VOXEL_M, DrawnSurface, smooth_borders
 from taichi_mrf.evaluation.pictures.surfaces import up_direction, upward_axis
-from taichi_mrf.evaluation.pictures.viewpoint import overview_pose
+from taichi_mrf.evaluation.pictures.viewpoint import LIGHT, PERSPECTIVE, height_span, overview_pose
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.inference.schedule import Progress

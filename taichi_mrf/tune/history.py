@@ -9,8 +9,7 @@ from typing import Any, Literal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.viewer.tune.messages import By, Tried
-from taichi_mrf.viewer.tune.scores import Scores, figures, scores_in_words
+from taichi_mrf.viewer.tune.messages import By, Scores, Tried, figures, scores_in_words
 
 TABLE_FILE = "tries.csv"
 BEST_FILE = "best.yaml"

@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import Config, PoseConfig, without_window
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
-from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
-from taichi_mrf.evaluation.held_out import surface_depth
+from taichi_mrf.evaluation.held_out import pooled_depth_error, surface_depth
 from taichi_mrf.mapping.intake import Full, Intake
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.working_set import VoxelTruth, WorkingSet, thinned
-from taichi_mrf.viewer.tune.scores import KINDS, Scores
+from taichi_mrf.viewer.tune.messages import KINDS, Scores
 
 SHIPPED, STARTED, FOUND = "shipped defaults", "where the search began", "found"
 

@@ -15,9 +15,8 @@ from taichi_mrf.benchmark import profile
 from taichi_mrf.benchmark.bandwidth import copy_bandwidth
 from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
 from taichi_mrf.benchmark.growth import elsewhere, fit_line, measure_growth
-from taichi_mrf.benchmark.kernel_floors import COPIES, FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, live_stages
-from taichi_mrf.benchmark.profile import host_seconds
+from taichi_mrf.benchmark.profile import COPIES, FLOORS, Work, host_seconds
 from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from taichi_mrf.calibration.board_images import find_boards, image_files
-from taichi_mrf.calibration.chessboard import board_depth, corner_points, find_board
+from taichi_mrf.calibration.chessboard import board_depth, corner_points, find_board, find_boards, image_files
 from taichi_mrf.calibration.options import BoardConfig
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import rotations

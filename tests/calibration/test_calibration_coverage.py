@@ -9,7 +9,7 @@ from calibration_scenes import CAMERA, Planes, random_tables
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.coverage import Coverage
-from taichi_mrf.calibration.learning import calibrate
+from taichi_mrf.calibration.fit import calibrate
 from taichi_mrf.calibration.noise_pictures import central_third
 from taichi_mrf.calibration.options import CalibrationConfig
 from taichi_mrf.calibration.report import write_pictures

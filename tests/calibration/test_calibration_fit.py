@@ -6,9 +6,8 @@ from calibration_scenes import CAMERA, Planes, Tables, random_tables
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from taichi_mrf.calibration.curves import Curves, kept_above
-from taichi_mrf.calibration.fit import LearntNoise
-from taichi_mrf.calibration.learning import Calibration, calibrate
+from taichi_mrf.calibration.fit import Calibration, LearntNoise, calibrate
+from taichi_mrf.calibration.least_squares import Curves, kept_above
 from taichi_mrf.calibration.options import HIGHEST_DEGREE, CalibrationConfig
 from taichi_mrf.calibration.pairs import DepthPair
 from taichi_mrf.errors import ConfigError, DatasetError

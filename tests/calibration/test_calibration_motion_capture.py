@@ -8,9 +8,8 @@ from calibration_boards import BOARD, CAMERA, board_motion, captured, ideal_view
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.calibration.motion_capture import Alignment, align, hand_eye
+from taichi_mrf.calibration.motion_capture import Alignment, BodyPair, align, estimate_lag, hand_eye
 from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
-from taichi_mrf.calibration.time_lag import BodyPair, estimate_lag
 from taichi_mrf.calibration.truth_sources import stamps_of
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import ConfigError, DatasetError

@@ -18,7 +18,7 @@ from taichi_mrf.datasets.laser.floor_plan_scans import (
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.evaluation.laser.floor_plan_frame import end_points
+from taichi_mrf.evaluation.floor_plan import end_points
 
 BUILDING = building()
 EAST, NORTH, WEST, SOUTH = (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.datasets.laser.plan_image import FloorPlan
-from taichi_mrf.evaluation.laser.laser_map import LaserMap
+from taichi_mrf.evaluation.floor_plan import LaserMap
 from taichi_mrf.evaluation.pictures.laser_pictures import (
     METHOD_NAMES,
     comparison_figure,

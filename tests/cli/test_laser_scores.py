@@ -14,15 +14,15 @@ from taichi_mrf.datasets.laser.plan_image import FloorPlan, read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.evaluation.laser.floor_plan_frame import register
-from taichi_mrf.evaluation.laser.floor_plan_scores import (
+from taichi_mrf.evaluation.floor_plan import (
     FREE,
     HIDDEN,
     OCCUPIED,
+    LaserMap,
     floor_plan_scores,
+    register,
     true_cells,
 )
-from taichi_mrf.evaluation.laser.laser_map import LaserMap
 
 
 def a_map(occupied: list[str], unseen: str = "?", cell_size: float = 1.0) -> LaserMap:

@@ -12,7 +12,7 @@ from refusals import refused
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import start_pose
-from taichi_mrf.sensor.acceleration import GRAVITY, upwards
+from taichi_mrf.sensor.motion import GRAVITY, upwards
 
 TOPIC, BODY = "/imu/data", "imu_link"
 T_camera_imu = moved(np.eye(4), [0.02, 0.0, 0.01, 1.2, -0.9, 0.4])

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin, storage_mcap
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from taichi_mrf.calibration.depth_files import DepthFiles
+from taichi_mrf.calibration.pairs import DepthFiles
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.image_header import claimed_size

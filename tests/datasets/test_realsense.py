@@ -22,7 +22,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.realsense.device import MISSES
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.sensor.acceleration import GRAVITY
+from taichi_mrf.sensor.motion import GRAVITY
 
 
 class Pipeline:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.depth_error import DepthError, depth_error, pooled_depth_error
+from taichi_mrf.evaluation.held_out import DepthError, depth_error, pooled_depth_error
 
 
 def _nothing_compared(error: DepthError) -> bool:

@@ -10,8 +10,16 @@ from numpy.typing import NDArray
 from taichi_mrf import open_dataset
 from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.evaluation.noise_check import NoiseCheck, check_noise
-from taichi_mrf.evaluation.noise_fit import LEAST_PIXELS, OCTAVES, Explained, pooled, sigma_factor, sigma_law
+from taichi_mrf.evaluation.noise_fit import (
+    LEAST_PIXELS,
+    OCTAVES,
+    Explained,
+    NoiseCheck,
+    check_noise,
+    pooled,
+    sigma_factor,
+    sigma_law,
+)
 from taichi_mrf.mapping.pipeline import map_sequence
 
 N = 20_000

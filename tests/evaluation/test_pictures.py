@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.evaluation.pictures.raster import cast_voxels
 from taichi_mrf.evaluation.pictures.room_views import DrawnMap, top_view
 from taichi_mrf.evaluation.pictures.run_pictures import depth_comparison, write_pictures
 from taichi_mrf.evaluation.pictures.surfaces import level_rotation, seen_surfaces, up_direction, upward_axis
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
-from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.pictures import voxel_raster
-from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
+from taichi_mrf.evaluation.pictures import raster
+from taichi_mrf.evaluation.pictures.raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -62,12 +62,12 @@ def test_first_hits_are_exact(seed: int, voxel_size: float) -> None:
 
 def test_hidden_voxels_and_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several layers, so that most voxels are dropped by the coarse depth image."""
-    monkeypatch.setattr(voxel_raster, "_VOXELS_AT_ONCE", 64)
-    monkeypatch.setattr(voxel_raster, "_PAIRS_AT_ONCE", 100)
+    monkeypatch.setattr(raster, "_VOXELS_AT_ONCE", 64)
+    monkeypatch.setattr(raster, "_PAIRS_AT_ONCE", 100)
     tested = []
-    pairs = voxel_raster.pixels_of_rectangles
+    pairs = raster.pixels_of_rectangles
     monkeypatch.setattr(
-        voxel_raster,
+        raster,
         "pixels_of_rectangles",
         lambda voxels, *rest: (tested.append(voxels), pairs(voxels, *rest))[1],
     )

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from taichi_mrf.evaluation.pictures.overview import backdrop
-from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, surface_view
-from taichi_mrf.evaluation.pictures.triangle_raster import cast_triangles
+from taichi_mrf.evaluation.pictures.raster import cast_triangles
+from taichi_mrf.evaluation.pictures.room_views import DrawnSurface, surface_view
+from taichi_mrf.evaluation.pictures.viewpoint import backdrop
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 

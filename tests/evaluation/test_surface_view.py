@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.pictures.overview import backdrop
-from taichi_mrf.evaluation.pictures.room_views import DrawnMap, top_view
-from taichi_mrf.evaluation.pictures.surface_view import (
+from taichi_mrf.evaluation.pictures.room_views import (
     PHOTO_VOXEL_M,
+    DrawnMap,
     DrawnSurface,
     smooth_borders,
     surface_view,
+    top_view,
 )
+from taichi_mrf.evaluation.pictures.viewpoint import backdrop
 
 UP = np.array([0.0, 0.0, 1.0])
 WHITE = np.full(3, 255, np.uint8)

@@ -11,11 +11,19 @@ from taichi_mrf import PinholeCamera, PolynomialNoise
 from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.experiments.peers import cases, our_maps, run
-from taichi_mrf.experiments.peers.measuring import RIGHT, Case, answer_scores, measured
+from taichi_mrf.experiments.peers.cases import (
+    FREE_A_PIXEL,
+    RIGHT,
+    Case,
+    KnownPoints,
+    along_rays,
+    answer_scores,
+    cell_scores,
+    measured,
+)
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Peer, System, thinned
 from taichi_mrf.experiments.peers.run import Point, frontier
 from taichi_mrf.experiments.peers.systems import OctomapPeer, TsdfPeer, systems
-from taichi_mrf.experiments.peers.truth import FREE_A_PIXEL, KnownPoints, along_rays, cell_scores
 from taichi_mrf.experiments.run import EXPERIMENTS, run_experiment
 from taichi_mrf.experiments.scenes import Scene, SceneView
 

@@ -19,8 +19,14 @@ from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.stereo import maps as stereo
-from taichi_mrf.experiments.stereo.artefact_curve import artefacts_at, curve, threshold_for
-from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, updates_to
+from taichi_mrf.experiments.stereo.growth import (
+    artefacts_at,
+    corridor_scene,
+    curve,
+    grow,
+    threshold_for,
+    updates_to,
+)
 from taichi_mrf.experiments.stereo.maps import log_likelihood, ratio
 from taichi_mrf.experiments.stereo.street import (
     RECORDING,

@@ -15,9 +15,8 @@ from taichi_mrf.evaluation.tables import Spread, Table
 from taichi_mrf.experiments import folds, tuning
 from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.scenes import Scene, coffin_scene
-from taichi_mrf.experiments.score_tables import COLUMNS
 from taichi_mrf.experiments.table1 import PAPER, run_table1
-from taichi_mrf.experiments.tuning import GRID
+from taichi_mrf.experiments.tuning import COLUMNS, GRID
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap

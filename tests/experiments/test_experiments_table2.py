@@ -22,11 +22,10 @@ from taichi_mrf.experiments import table2
 from taichi_mrf.experiments.contenders import standard_contenders
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.scenes import Scene, house_scene, kitchen_scene
-from taichi_mrf.experiments.score_tables import COLUMNS
 from taichi_mrf.experiments.table2 import run_table2
 from taichi_mrf.experiments.table3 import PAPER as PAPER3
 from taichi_mrf.experiments.table3 import run_table3
-from taichi_mrf.experiments.tuning import GRID
+from taichi_mrf.experiments.tuning import COLUMNS, GRID
 from taichi_mrf.experiments.tuning import NAME as TUNED
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL

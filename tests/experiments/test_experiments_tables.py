@@ -24,7 +24,7 @@ from taichi_mrf.evaluation.tables import (
     write_table,
 )
 from taichi_mrf.experiments.folds import Scored
-from taichi_mrf.experiments.score_tables import COLUMNS, score_table
+from taichi_mrf.experiments.tuning import COLUMNS, score_table
 
 TABLE = Table(
     "some_table",

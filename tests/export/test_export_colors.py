@@ -11,7 +11,7 @@ from queried_maps import map_of, room_map
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.formats import export_map
-from taichi_mrf.export.octree import BRICK_LEVEL, DEPTH, WHITE, channels, octree_of
+from taichi_mrf.export.octomap import BRICK_LEVEL, DEPTH, WHITE, channels, octree_of
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.colored import blended_colors

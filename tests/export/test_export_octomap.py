@@ -12,9 +12,8 @@ from hand_made import PRIOR, VOXEL
 from queried_maps import HandMap, hand_map, map_of, room_map
 
 from taichi_mrf.errors import CapacityError, ConfigError, MapFileError
-from taichi_mrf.export.octomap import write_bt, write_ot
+from taichi_mrf.export.octomap import brick_codes, bricks_of_codes, octree_of, write_bt, write_ot, z_order
 from taichi_mrf.export.octomap_reader import OctomapLeaves, read_octomap
-from taichi_mrf.export.octree import brick_codes, bricks_of_codes, octree_of, z_order
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.known_bricks import BrickReader, known_bricks

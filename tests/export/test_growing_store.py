@@ -9,8 +9,7 @@ import pytest
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader
-from taichi_mrf.export.growing_store import put_chunks
+from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, put_chunks
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.submaps.round_files import RoundResult, SubmapReport, read_layer, write_round
 from taichi_mrf.voxels.layers import LAYERS, LOG_ODDS, BrickValues, Chunk, Layer, Layers

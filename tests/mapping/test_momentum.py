@@ -16,9 +16,8 @@ from taichi_mrf.geometry.poses import Pose, inverse, look_at, tangent_norms
 from taichi_mrf.mapping.momentum import Momentum
 from taichi_mrf.mapping.tracking import Tracker
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.acceleration import GRAVITY, AccelerationSamples
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import GyroSamples
+from taichi_mrf.sensor.motion import GRAVITY, AccelerationSamples, GyroSamples
 
 IMU_HZ, FRAMES_HZ, COUNT = 200.0, 3.0, 14
 AT_M = np.array([0.05, -0.1, 0.15])

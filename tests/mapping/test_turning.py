@@ -17,7 +17,7 @@ from taichi_mrf.mapping.tracking import Tracker
 from taichi_mrf.mapping.turning import GyroTurns, turned
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import GyroSamples
+from taichi_mrf.sensor.motion import GyroSamples
 
 FRAMES_HZ, GYRO_HZ = 5.0, 200.0
 COUNT = 12

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_mrf.sensor.gyro import LARGEST_GAP_S, GyroSamples
+from taichi_mrf.sensor.motion import LARGEST_GAP_S, GyroSamples
 
 RATE = np.array([0.4, -1.1, 0.7])
 

@@ -8,7 +8,7 @@ import pytest
 from live_scene import CONFIG, FakeLink, finished, map_voxels, never, session_of, shown
 
 from taichi_mrf.config.sections import TimeConfig
-from taichi_mrf.evaluation.pictures.surface_view import smooth_borders
+from taichi_mrf.evaluation.pictures.room_views import smooth_borders
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.mrf.map import MRFMap

@@ -49,7 +49,7 @@ from rtabmap_database import Database, calibration, encoded, rvl
 from stereo_rig import write as write_stereo_file
 from stereo_rig import write_kitti
 
-from taichi_mrf.calibration.depth_files import DepthFiles
+from taichi_mrf.calibration.pairs import DepthFiles
 from taichi_mrf.calibration.truth_sources import read_stamps
 from taichi_mrf.config.schema import Config, VolumeConfig, load
 from taichi_mrf.config.text import commented_yaml

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.alignment.se3 import moved
-from taichi_mrf.sensor.acceleration import GRAVITY
+from taichi_mrf.sensor.motion import GRAVITY
 
 R_DEPTH_IMU = moved(np.eye(4), [0, 0, 0, 1.2, -0.9, 0.4])[:3, :3]
 RATE = np.array([0.3, -0.8, 0.5])

@@ -11,10 +11,9 @@ from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.history import History
-from taichi_mrf.viewer.tune.messages import Tried
+from taichi_mrf.viewer.tune.messages import Scores, Tried
 from taichi_mrf.viewer.tune.panel import table_html
-from taichi_mrf.viewer.tune.score_board import score_board_html, sparkline_svg
-from taichi_mrf.viewer.tune.scores import Scores
+from taichi_mrf.viewer.tune.plots import score_board_html, sparkline_svg
 
 SCORES = Scores(0.5, 0.9, 0.8, 0.01, 0.02, 0.1, 1.25, 0.03, float("nan"), 2.5, 70_000, 8)
 FIRST = Config(voxel_size=0.1)

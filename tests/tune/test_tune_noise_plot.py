@@ -10,7 +10,7 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, noise_from_config
 from taichi_mrf.viewer.tune.messages import Residuals
-from taichi_mrf.viewer.tune.noise_plot import NoiseCurves, plot_data, sentence
+from taichi_mrf.viewer.tune.plots import NoiseCurves, plot_data, sentence
 
 CAMERA = PinholeCamera(width=8, height=6, fx=8.0, fy=8.0, cx=3.5, cy=2.5)
 DEPTH_M = np.linspace(0.5, 4.0, 7)

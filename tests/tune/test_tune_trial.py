@@ -10,8 +10,8 @@ from taichi_mrf.config.schema import KeyframeConfig, SensorConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.evaluation.accuracy import OUTLIERS, judge_view
-from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.evaluation.depth_intervals import interval_error, probability_below
+from taichi_mrf.evaluation.held_out import pooled_depth_error
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame

@@ -8,7 +8,7 @@ import pytest
 
 from taichi_mrf.export.page import add_cells
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 

@@ -18,13 +18,13 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.scene.safe_text import LONGEST, in_html, in_markdown
+from taichi_mrf.viewer.scene.widgets import LONGEST, in_html, in_markdown
 from taichi_mrf.viewer.transport.downloads import standalone_page
 from taichi_mrf.viewer.transport.process import AnyPage
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.tune import messages as t
+from taichi_mrf.viewer.tune.messages import Scores
 from taichi_mrf.viewer.tune.page import TunePage
-from taichi_mrf.viewer.tune.scores import Scores
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -14,9 +14,15 @@ from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
+from taichi_mrf.viewer.scene.coloring import (
+    OF_BELIEFS,
+    ColorBy,
+    ViewOptions,
+    legend_html,
+    scale_of,
+    voxel_colors,
+)
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement, border
-from taichi_mrf.viewer.scene.options import OF_BELIEFS, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_layer import look_of

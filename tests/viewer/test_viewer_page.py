@@ -14,11 +14,11 @@ from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.actions import Action, Dragged
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.live.panel import Action, Dragged
+from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.transport import downloads
-from taichi_mrf.viewer.transport.inbox import Joined
+from taichi_mrf.viewer.transport.process import Joined
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
-from taichi_mrf.viewer.scene.cut_plane import FREE, OCCUPIED, UNKNOWN, cut_picture, cut_voxel
 from taichi_mrf.viewer.scene.map_scene import brick_edges
+from taichi_mrf.viewer.scene.voxel_layer import FREE, OCCUPIED, UNKNOWN, cut_picture, cut_voxel
 from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS, offsets_in_brick
 

@@ -10,9 +10,9 @@ import pytest
 from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.actions import Clicked
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.live.panel import Clicked
+from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
 
 VOXEL = 0.1

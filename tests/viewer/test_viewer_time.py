@@ -8,10 +8,9 @@ import pytest
 from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.live.panel import Action
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, ViewOptions
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
 START_S = 1.7e9

@@ -8,11 +8,11 @@ import pytest
 from handled_page import HandledPage
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.viewer.transport.inbox import Used
+from taichi_mrf.viewer.transport.process import Used
 from taichi_mrf.viewer.tune import messages as t
+from taichi_mrf.viewer.tune.messages import Scores
 from taichi_mrf.viewer.tune.page import TunePage
 from taichi_mrf.viewer.tune.panel import Action, KnobMoved
-from taichi_mrf.viewer.tune.scores import Scores
 
 FIRST = Config(voxel_size=0.1)
 OTHER = replace(FIRST, voxel_size=0.15)

@@ -37,7 +37,7 @@ from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ClusterError, TaichiMRFError
-from taichi_mrf.evaluation.pictures.contact_sheet import write_contact_sheet
+from taichi_mrf.evaluation.pictures.figures import write_contact_sheet
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system.atomic import write_text

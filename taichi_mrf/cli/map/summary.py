@@ -14,7 +14,7 @@ from taichi_mrf.cli.map.sequence import Outcome
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.evaluation.pictures.contact_sheet import Tile
+from taichi_mrf.evaluation.pictures.figures import Tile
 from taichi_mrf.evaluation.tables import Table
 from taichi_mrf.system.files import exists, is_folder
 

@@ -17,10 +17,9 @@ from taichi_mrf.datasets.base import Row, Table
 from taichi_mrf.datasets.images import measured
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import GyroSamples
+from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
 
 END_MS = 500
 """A recording that delivers no image for this long has ended: it is read from disk without waiting."""

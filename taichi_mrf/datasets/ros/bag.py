@@ -45,10 +45,9 @@ from taichi_mrf.datasets.ros.topics import (
 from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.gyro import GyroSamples
+from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
 from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"

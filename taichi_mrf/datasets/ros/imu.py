@@ -11,8 +11,7 @@ from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import choose
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.sensor.acceleration import AccelerationSamples, upwards_at
-from taichi_mrf.sensor.gyro import GyroSamples
+from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples, upwards_at
 
 NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""

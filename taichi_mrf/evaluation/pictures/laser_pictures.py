@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.laser.plan_image import FloorPlan
-from taichi_mrf.evaluation.laser.laser_map import LaserMap
+from taichi_mrf.evaluation.floor_plan import LaserMap
 from taichi_mrf.evaluation.pictures.figures import new_figure
 
 if TYPE_CHECKING:

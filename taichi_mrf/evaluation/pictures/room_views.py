@@ -1,4 +1,6 @@
-"""A whole map in one picture: a plan from above, and a doll's-house view of its voxels from outside."""
+"""A whole map in one picture: a plan from above, and a doll's-house view of its voxels or of its surface from
+outside, without what would be in the way.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,27 +10,78 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
-from taichi_mrf.evaluation.pictures.overview import (
+from taichi_mrf.evaluation.pictures.raster import cast_triangles, cast_voxels, shaded, shaded_triangles
+from taichi_mrf.evaluation.pictures.surfaces import level_rotation
+from taichi_mrf.evaluation.pictures.viewpoint import (
     HEIGHT_COLORS,
     HEIGHT_LABEL,
     LIGHT,
     OVERSAMPLING,
     PERSPECTIVE,
     backdrop,
+    faces_viewer,
     height_colors,
     overview,
+    overview_pose,
 )
-from taichi_mrf.evaluation.pictures.shading import shaded, shaded_triangles
-from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, smooth_borders
-from taichi_mrf.evaluation.pictures.surfaces import level_rotation
-from taichi_mrf.evaluation.pictures.triangle_raster import cast_triangles
-from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
-from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+PHOTO_VOXEL_M = 0.02
+"""The largest voxels whose surface is drawn in the colours of photographs; on larger ones these smear."""
+
+_BORDER_PASSES = 4
+
+
+@dataclass(frozen=True)
+class DrawnSurface:
+    """A surface to draw, world frame, metres: ``vertices_m`` (V, 3), ``triangles`` (T, 3), at least one,
+    ``normals`` (V, 3) and ``colors`` (V, 3) RGB, None to colour it by height."""
+
+    vertices_m: NDArray[np.floating]
+    triangles: NDArray[np.integer]
+    normals: NDArray[np.floating]
+    colors: NDArray[np.uint8] | None
+
+
+def surface_view(surface: DrawnSurface, voxel_size: float, up: NDArray[np.float64]) -> "Figure":
+    """The surface under a light, in the colours that cameras saw if voxels are small enough, else by height;
+    what faces away from the viewer is not seen."""
+    triangles = surface.triangles
+    vertices_m = smooth_borders(surface.vertices_m, triangles)
+    pose = overview_pose(vertices_m, surface.normals, up, PERSPECTIVE, voxel_size)
+    camera = PERSPECTIVE.scaled(OVERSAMPLING)
+    image = cast_triangles(vertices_m, triangles, camera, pose)
+    colors, height_range = surface.colors, None
+    if colors is None or voxel_size > PHOTO_VOXEL_M:
+        colors, height_range = height_colors(vertices_m @ up, voxel_size)
+    light = pose[:3, :3] @ LIGHT
+    picture = shaded_triangles(image, triangles, colors, surface.normals, light, backdrop(camera.shape))
+    how = "in the colours of the images" if height_range is None else "by height"
+    title = f"the measured surface {how}, voxels of {100 * voxel_size:.3g} cm; what faces away is left out"
+    return overview(picture, title, height_range)
+
+
+def smooth_borders(vertices_m: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+    """The vertices (V, 3) with those at borders moved towards their neighbours on them: where a surface ends,
+    its triangles end in the steps of the voxels."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
+    count = len(vertices_m)
+    distinct, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    one, other = np.divmod(distinct[uses == 1], count)
+    ends, beside = np.concatenate([one, other]), np.concatenate([other, one])
+    neighbours = np.bincount(ends, minlength=count)
+    border = np.flatnonzero(neighbours)
+    smooth = np.array(vertices_m, np.float64)
+    for _ in range(_BORDER_PASSES):
+        sums = np.stack([np.bincount(ends, smooth[beside, axis], count) for axis in range(3)], axis=1)
+        smooth[border] = 0.5 * (smooth[border] + sums[border] / neighbours[border, None])
+    return smooth
+
 
 _PLAN_PIXELS = 1200
 """Longer side of the plan."""

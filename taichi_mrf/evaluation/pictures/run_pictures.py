@@ -6,11 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taichi_mrf.evaluation.depth_error import depth_error
-from taichi_mrf.evaluation.held_out import surface_depth
+from taichi_mrf.evaluation.held_out import depth_error, surface_depth
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
-from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
-from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, surface_view
+from taichi_mrf.evaluation.pictures.room_views import (
+    DrawnMap,
+    DrawnSurface,
+    perspective,
+    surface_view,
+    top_view,
+)
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction, upward_axis
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.methods.capabilities import measures_surface

@@ -15,8 +15,7 @@ from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.peers.cases import PeerScene, peer_scenes
-from taichi_mrf.experiments.peers.measuring import RIGHT, Case, measured
+from taichi_mrf.experiments.peers.cases import RIGHT, Case, PeerScene, measured, peer_scenes
 from taichi_mrf.experiments.peers.peer import Knob, System
 from taichi_mrf.experiments.peers.systems import MRF, systems
 from taichi_mrf.system.atomic import atomic_path

@@ -15,22 +15,20 @@ from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.experiments.stereo.artefact_curve import (
-    MAJORITIES,
-    artefacts_at,
-    curve,
-    curve_figure,
-    threshold_for,
-)
 from taichi_mrf.experiments.stereo.growth import (
+    MAJORITIES,
     OCTOMAP,
     STRIDES,
+    artefacts_at,
     corridor_scene,
+    curve,
+    curve_figure,
     grow,
     growth_figure,
     growth_rows,
     measured_methods,
     scaling_figure,
+    threshold_for,
     time_mapping,
     time_octomap,
 )

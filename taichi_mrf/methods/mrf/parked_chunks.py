@@ -1,6 +1,6 @@
 """The folder of a map with a window: what is outside of the window, and the voxels of all for any reader.
 
-The folder is a map in chunks (export/growing_store.py), which ChunkedMap reads. Beside the voxels it holds,
+The folder is a map in chunks (export/chunk_store.py), which ChunkedMap reads. Beside the voxels it holds,
 in ``parked/``, a file for each chunk that is not in memory (parked_chunk.py). A saved map names those that
 belong to it, and they are kept until it is saved again.
 """
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_store import SUFFIX, ChunkStore, new_store
-from taichi_mrf.export.growing_store import put_chunks
+from taichi_mrf.export.chunk_store import SUFFIX, ChunkStore, new_store, put_chunks
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk, chunk_of, read_parked
 from taichi_mrf.system.files import is_file

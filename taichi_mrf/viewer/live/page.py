@@ -8,20 +8,22 @@ import viser
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.actions import Action, Clicked, Dragged
 from taichi_mrf.viewer.live.panel import (
     CHOSEN_KEYFRAME,
     POSITION_STEP_M,
     RESET_QUESTION,
     SPEEDS,
+    Action,
+    Clicked,
+    Dragged,
     Panel,
     freeze_question,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
+from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import Placement
-from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
-from taichi_mrf.viewer.transport.inbox import Inbox
+from taichi_mrf.viewer.transport.process import Inbox
 
 _PLAIN = ViewOptions(show="voxels")
 """Options that the mapping process serves unless it is asked for more."""

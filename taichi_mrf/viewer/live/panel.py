@@ -1,14 +1,15 @@
-"""The widgets of the live page, with the folder "Time" of a map whose world may change. page.py decides
-what they do."""
+"""The widgets of the live page, with the folder "Time" of a map whose world may change. The page decides what
+they do.
+"""
 
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 import viser
 
-from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.messages import (
     Hello,
     Images,
@@ -19,11 +20,54 @@ from taichi_mrf.viewer.messages import (
     TimeSpan,
 )
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import dynamic_legend_html
-from taichi_mrf.viewer.scene.options import OF_BELIEFS, ColorBy, Show, ViewOptions
+from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
-from taichi_mrf.viewer.scene.widgets import OptionWidgets
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html, in_markdown
+from taichi_mrf.viewer.transport.process import Event
+
+
+class Action(Enum):
+    """A button, or a widget whose value asks the mapping process for something."""
+
+    PLAY = auto()
+    PAUSE = auto()
+    STEP = auto()
+    SPEED = auto()
+    RESET = auto()
+    RESET_CONFIRMED = auto()
+    CHOOSE_KEYFRAME = auto()
+    SWITCH = auto()
+    FREEZE = auto()
+    FREEZE_CONFIRMED = auto()
+    CANCELLED = auto()
+    TOGGLE_GIZMO = auto()
+    PUT_BACK = auto()
+    SET_POSITION = auto()
+    SHOW_PIXEL_RAY = auto()
+    WATCH_IMAGES = auto()
+    SHOW_TIME = auto()
+    SAVE_MAP = auto()
+    SAVE_VOXELS = auto()
+    SAVE_MESH = auto()
+    SAVE_PICTURE = auto()
+    SAVE_PAGE = auto()
+    RECORD = auto()
+
+
+@dataclass(frozen=True)
+class Clicked(Event):
+    """A click into the scene: the ray from the viewpoint, in the world frame, metres."""
+
+    origin: tuple[float, float, float]
+    direction: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Dragged(Event):
+    """The gizmo was grabbed, or let go where it is now."""
+
+    holding: bool
+
 
 RUN_BUTTONS = {
     "Play": Action.PLAY, "Pause": Action.PAUSE, "Step": Action.STEP, "Reset": Action.RESET,

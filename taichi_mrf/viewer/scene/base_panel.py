@@ -8,9 +8,9 @@ from typing import Any, Literal
 import viser
 
 from taichi_mrf.viewer.messages import Notice
-from taichi_mrf.viewer.scene.options import ViewOptions
-from taichi_mrf.viewer.scene.safe_text import in_html
-from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
+from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.scene.widgets import in_html
+from taichi_mrf.viewer.transport.process import Event, OptionsMoved, Used
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
 Tell = Callable[[Event], None]

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
-from taichi_mrf.viewer.scene.coloring import Scale
-from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
-from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, look_of
+from taichi_mrf.viewer.scene.voxel_layer import CutPlane, Look, VoxelLayer, cut_picture, look_of
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 

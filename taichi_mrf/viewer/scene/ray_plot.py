@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from taichi_mrf.viewer.messages import RayAnswer
-from taichi_mrf.viewer.scene.safe_text import in_markdown
+from taichi_mrf.viewer.scene.widgets import in_markdown
 
 Curves = tuple[NDArray[np.float64], ...]
 

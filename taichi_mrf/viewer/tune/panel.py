@@ -18,15 +18,12 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.options import OF_BELIEFS, ViewOptions
-from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget
-from taichi_mrf.viewer.transport.inbox import Event
+from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ViewOptions
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, in_html, in_markdown
+from taichi_mrf.viewer.transport.process import Event
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
-from taichi_mrf.viewer.tune.messages import Activity, FrameChoice, HeldOutView, Tried, Tuning
-from taichi_mrf.viewer.tune.noise_plot import NoisePlot
-from taichi_mrf.viewer.tune.score_board import score_board_html
-from taichi_mrf.viewer.tune.scores import KINDS
+from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
+from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
 
 
 class Action(Enum):

@@ -1,18 +1,24 @@
-"""The first voxel that each pixel of a camera sees, exactly, from nothing but a list of voxels.
+"""Pictures from nothing but a list of voxels or of triangles: the first that each pixel of a camera sees,
+exactly, and light on it, so that its shape is legible and its colours still mean something.
 
-Independent of the map and its kernels, so pictures of any voxel list can be drawn, clipped or
-filtered, on any machine. Each voxel is tested (slab test) against the pixels of its projected bounding
-rectangle, near voxels first; a coarse depth pyramid drops those that are hidden (hierarchical
-z-buffer, Greene, Kass and Miller 1993), so a map of millions of voxels takes seconds in NumPy.
+Independent of the map and its kernels, so pictures of any voxel list can be drawn, clipped or filtered, on
+any machine. Each voxel is tested (slab test) against the pixels of its projected bounding rectangle, near
+voxels first; a coarse depth pyramid drops those that are hidden (hierarchical z-buffer, Greene, Kass and
+Miller 1993), so a map of millions of voxels takes seconds in NumPy.
+
+Triangles are seen from the side from which they run counter-clockwise. Each is tested against the pixels of
+its projected bounding rectangle (edge functions, Pineda 1988), and the nearest wins.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _BLOCK = 16
@@ -175,3 +181,152 @@ def _image(
         index=index.reshape(camera.shape),
         normal=normal.reshape(*camera.shape, 3),
     )
+
+
+_NEAR_M = 0.01
+"""A depth of infinity (as float32 bits) and no triangle."""
+
+
+@dataclass(frozen=True)
+class TriangleImage:
+    """Image of triangles: ``depth_m`` (H, W) axial, NaN where there is nothing; ``index`` (H, W) of the
+    triangle, -1 for none; ``shares`` (H, W, 3) of its three corners at the pixel."""
+
+    depth_m: NDArray[np.float32]
+    index: NDArray[np.int64]
+    shares: NDArray[np.float32]
+
+
+def cast_triangles(
+    vertices_m: NDArray[np.floating],
+    triangles: NDArray[np.integer],
+    camera: PinholeCamera,
+    T_world_camera: Pose,
+) -> TriangleImage:
+    """Look at triangles (T, 3) between vertices (V, 3), in metres, world. Those that reach behind the camera
+    are left out."""
+    T = inverse(T_world_camera)
+    x, y, depth = (np.asarray(vertices_m, np.float64) @ T[:3, :3].T + T[:3, 3]).T
+    ahead = np.maximum(depth, _NEAR_M)
+    u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+    corners = np.stack([u[triangles], v[triangles]], axis=-1)
+    # Rows grow downwards, so counter-clockwise triangles have a negative area in pixels.
+    edges = corners[:, 1:] - corners[:, :1]
+    area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    first, last = np.ceil(corners.min(axis=1)), np.floor(corners.max(axis=1))
+    size = np.array([camera.width, camera.height])
+    seen = (area < 0) & (depth[triangles] > _NEAR_M).all(axis=1)
+    seen &= (first <= last).all(axis=1) & (last >= 0).all(axis=1) & (first < size).all(axis=1)
+    rows = np.flatnonzero(seen)
+    bounds = np.clip(np.stack([first[rows], last[rows]], axis=1), 0, size - 1).astype(np.int32)
+    box = bounds.transpose(0, 2, 1).reshape(-1, 4)
+    words = np.full(camera.width * camera.height, _NOTHING)
+    for place, pixel in pixels_of_rectangles(np.arange(len(rows)), box, camera.width):
+        row = rows[place]
+        shares = _shares(corners[row], area[row], pixel, camera.width)
+        inside = (shares >= 0).all(axis=1)
+        row, pixel = row[inside], pixel[inside]
+        nearness = (shares[inside] / depth[triangles[row]]).sum(axis=1)
+        bits = (1.0 / nearness).astype(np.float32).view(np.uint32).astype(np.uint64)
+        np.minimum.at(words, pixel, (bits << np.uint64(32)) | row.astype(np.uint64))
+    found = (words >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    met = np.flatnonzero(np.isfinite(found))
+    index = np.full(words.shape, -1, np.int64)
+    index[met] = (words[met] & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    seen_shares = np.zeros((len(words), 3), np.float32)
+    # Shares on the screen become shares in space: nearer corners count more.
+    near = _shares(corners[index[met]], area[index[met]], met, camera.width) / depth[triangles[index[met]]]
+    seen_shares[met] = near / near.sum(axis=1, keepdims=True)
+    depth_m = np.where(np.isfinite(found), found, np.float32(np.nan)).reshape(camera.shape)
+    return TriangleImage(depth_m, index.reshape(camera.shape), seen_shares.reshape(*camera.shape, 3))
+
+
+def _shares(
+    corners: NDArray[np.float64], area: NDArray[np.float64], pixel: NDArray[np.integer], width: int
+) -> NDArray[np.float64]:
+    """The shares of the corners (n, 3, 2) of triangles at pixels (n,), on the screen: (n, 3)."""
+    row, column = np.divmod(pixel, width)
+    away = corners - np.stack([column, row], axis=1)[:, None]
+    opposite = [
+        away[:, a, 0] * away[:, b, 1] - away[:, a, 1] * away[:, b, 0] for a, b in ((1, 2), (2, 0), (0, 1))
+    ]
+    return np.stack(opposite, axis=1) / area[:, None]
+
+
+_AMBIENT = 0.62
+"""Brightness of a face that the light does not reach, relative to one that it meets squarely."""
+
+_OCCLUSION = 0.55
+"""How much of the light a deep hollow loses."""
+
+
+def shaded(
+    image: VoxelImage,
+    colors: NDArray[np.uint8],
+    normals: NDArray[np.floating],
+    towards_light: NDArray[np.floating],
+    background: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """Colours of the voxels (N, 3) under a far light, on a background (H, W, 3), RGB.
+
+    ``normals`` (N, 3) are the mean ones of the surfaces that the voxels belong to, 0 where unknown:
+    mixed with the normal of the voxel's face they show both the surface and the grid.
+    ``towards_light`` is a unit vector in the world frame.
+    """
+    hit = image.index >= 0
+    voxel = image.index[hit]
+    if voxel.size == 0:
+        return background
+    normal = image.normal[hit] + normals[voxel]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light, 0.0, 1.0)
+    light *= 1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]
+    picture = background.copy()
+    picture[hit] = np.rint(colors[voxel] * light[:, None])
+    return picture
+
+
+def shaded_triangles(
+    image: TriangleImage,
+    triangles: NDArray[np.integer],
+    colors: NDArray[np.uint8],
+    normals: NDArray[np.floating],
+    towards_light: NDArray[np.floating],
+    background: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """Colours and ``normals`` of vertices (V, 3) on their triangles (T, 3) under a far light, on a background
+    (H, W, 3), RGB."""
+    hit = image.index >= 0
+    if not hit.any():
+        return background
+    corners, shares = triangles[image.index[hit]], image.shares[hit]
+    mixed = _mixed(shares, colors[corners])
+    normal = _mixed(shares, normals[corners])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light.astype(np.float32), 0.0, 1.0)
+    picture = background.copy()
+    picture[hit] = np.rint(mixed * (light * (1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]))[:, None])
+    return picture
+
+
+def _mixed(shares: NDArray[np.float32], of_corners: NDArray[Any]) -> NDArray[np.float32]:
+    """Values of three corners, (n, 3, 3), mixed by their shares (n, 3)."""
+    return np.einsum("nk,nkc->nc", shares, of_corners.astype(np.float32))
+
+
+def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How far each pixel lies behind its surroundings, (H, W), 0 to 1: a cheap ambient occlusion.
+
+    The depth buffer's unsharp mask (Luft, Colditz and Deussen, SIGGRAPH 2006) at two scales.
+    """
+    met = np.isfinite(depth_m)
+    near, far = np.quantile(depth_m[met], [0.01, 0.99])
+    depth = np.where(met, depth_m, far).astype(np.float32)
+    full = max(0.04 * float(far - near), 1e-6)
+    out = np.zeros_like(depth)
+    size = depth.shape[1], depth.shape[0]
+    small = cv2.resize(depth, (-(-size[0] // 4), -(-size[1] // 4)), interpolation=cv2.INTER_AREA)
+    for share_of_width in (0.004, 0.016):
+        blurred = cv2.resize(cv2.GaussianBlur(small, (0, 0), share_of_width * small.shape[1]), size)
+        out += 0.5 * np.clip((depth - blurred) / full, 0.0, 1.0)
+    return out

@@ -1,1 +1,0 @@
-"""Scores of 2D floor maps against a floor plan."""
