@@ -51,6 +51,8 @@ class PoseEquations:
         """The step (poses, 6): 0 for poses that are not ``free`` (poses,), and for those without any term.
         ``damping`` is Levenberg's, a share of the diagonal."""
         size = 6 * self.poses
+        if not self._values:
+            return np.zeros((self.poses, 6))
         chosen = np.flatnonzero(np.repeat(free, 6))
         parts = (np.concatenate(part) for part in (self._values, self._rows, self._columns))
         values, rows, columns = parts

@@ -134,3 +134,8 @@ def test_sparse_equations_are_the_dense_ones() -> None:
     step = equations.step(np.array([False, True, True, True]))
     np.testing.assert_array_equal(step[0], 0)
     np.testing.assert_allclose(step[1:].ravel(), np.linalg.solve(dense[6:, 6:], -gradient[6:]), rtol=1e-6)
+
+
+def test_poses_that_nothing_is_known_of_stay() -> None:
+    # Keyframes that share nothing, as after a track that was lost at once, have no pair.
+    assert not PoseEquations(3).step(np.array([False, True, True])).any()
