@@ -115,7 +115,7 @@ def export_note(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULT
 def _shown_note(m: VoxelMap, path: str | Path, options: ExportOptions) -> str | None:
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is _surface or (writer is _points_or_surface and options.mesh):
-        if options.cubes or not hasattr(m, "has_surface"):
+        if options.cubes or not METHODS[m.config.method].measures_surface:
             return None
         if _with_rays(m, Path(path), options) is None:
             no_images = options.surface == "auto" and METHODS[m.config.method].can_freeze

@@ -35,7 +35,7 @@ class HandMap:
     crossed: NDArray[np.int32]
     voxel_size: float = VOXEL
     keyframes: dict[int, Any] = field(default_factory=dict)
-    config: Config = field(default_factory=Config)
+    config: Config = field(default_factory=lambda: Config(method="log_odds"))
     has_colors: bool = False
     has_surface: bool = False
 
