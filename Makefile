@@ -20,24 +20,26 @@ PYTHON ?= $(shell for python in $(CANDIDATES); do \
 # them takes seconds more, and the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run check test soak lint clean
+.PHONY: run check test soak lint style clean
 
 run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
 
-check: lint
+check: style
 	@$(BIN)/python tests/backends.py --quick --quiet -r fE
 
-test: lint
+test: style
 	@$(BIN)/python tests/backends.py
 
 soak: $(VENV)/.installed-dev
 	@$(BIN)/python -m pytest -m soak
 
-lint: $(VENV)/.installed-dev
+lint: style
+	$(BIN)/mypy
+
+style: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis *.egg-info

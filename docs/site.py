@@ -2,7 +2,7 @@
 
 MkDocs calls these hooks (mkdocs.yml). Nothing is written twice: the front page is README.md, the page of
 parameters is made from the dataclasses, the API page from docstrings (api_page.py), and the plan of the
-packages from floors.yaml (floor_plan.py).
+packages from floors.yaml (floor_plan.py), the way of a depth image from its table (depth_way.py).
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from api_page import api_page
+from depth_way import depth_way
 from floor_plan import floor_plan
 from mkdocs.structure.files import File, Files
 
@@ -29,8 +30,8 @@ BROUGHT_IN = {
 }
 """Page -> the file that it is made from."""
 
-FLOORS = "<!-- floors -->"
-"""The line that the plan of the packages replaces."""
+FLOORS, WAY = "<!-- floors -->", "<!-- way -->"
+"""The lines of docs/architecture.md that its two figures replace."""
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -48,7 +49,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     to files that are no pages become their names.
     """
     if FLOORS in markdown:
-        markdown = markdown.replace(FLOORS, floor_plan())
+        markdown = markdown.replace(FLOORS, floor_plan()).replace(WAY, f"<div>{depth_way(markdown)}</div>")
     for page, source in BROUGHT_IN.items():
         markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)

@@ -1,12 +1,12 @@
-"""Run the test suite once for each backend that there is here: the CPU with all tests, the others with
-those that are marked `backends`, `compilers` or `smoke`. Where a second compiler of kernels is installed, the
-CPU's tests that are marked `compilers` or `smoke` run with that too.
+"""Check the types, and run the test suite once for each backend that there is here: the CPU with all tests,
+the others with those that are marked `backends`, `compilers` or `smoke`. Where a second compiler of kernels
+is installed, the CPU's tests that are marked `compilers` or `smoke` run with that too.
 
     python tests/backends.py [options of pytest]
 
-With --quick the CPU alone has its turn. Some processes run the CPU's tests; each takes the next folder of
-tests that is not taken yet. All run side by side, because tests of pages and processes wait more than they
-compute. Each one's output is printed in one piece: the first's as it comes, the others' when that is done.
+With --quick the CPU alone has its turn. Some processes run the CPU's tests; each takes the next folder that
+is not taken yet. All run side by side, because tests of pages and processes wait more than they compute. Each
+one's output is printed in one piece: the first's as it comes, the others' when that is done.
 """
 
 import importlib.util
@@ -41,6 +41,7 @@ def main() -> int:
         command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
         share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
+        beside["mypy"] = [sys.executable, "-m", "mypy"]
         beside |= {_name(first, number, processes): share for number in range(2, processes + 1)}
         if not quick:
             beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
@@ -70,12 +71,12 @@ def _other_compilers() -> list[str]:
 
 def _finish(first: str, command: list[str], runs: list[Run]) -> int:
     """Run one command here, then wait for the others and print what they printed."""
-    print(f"== pytest on {first}; beside it: {'; '.join(name for name, _, _ in runs)}", flush=True)
+    print(f"== {first}; beside it: {'; '.join(name for name, _, _ in runs)}", flush=True)
     status = subprocess.run(command, check=False).returncode
     for name, process, output in runs:
         status = process.wait() or status
         output.seek(0)
-        print(f"== pytest on {name}", flush=True)
+        print(f"== {name}", flush=True)
         sys.stdout.buffer.write(output.read())
         sys.stdout.flush()
     return status

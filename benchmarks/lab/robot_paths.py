@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import FREE
+from taichi_mrf.queries.voxel_map import VoxelMap
 
 RADIUS_M = 0.2
 PLAY_M = 0.05
@@ -57,7 +57,7 @@ class Paths:
         points = self.starts[:, None] + along[:, None] * self.directions[:, None]
         return scene.signed_distance(points.reshape(-1, 3)).reshape(len(self), -1).min(axis=1)
 
-    def trusted(self, m: QueriedMap) -> NDArray[np.bool_]:
+    def trusted(self, m: VoxelMap) -> NDArray[np.bool_]:
         """Which paths the map shows as free throughout, (n,)."""
         taken = np.ones(len(self), np.bool_)
         ball = _around_a_path(min(_STEP_M, m.voxel_size))

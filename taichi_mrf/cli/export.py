@@ -14,12 +14,13 @@ from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_store import SUFFIX, new_store
-from taichi_mrf.export.formats import ExportedMap, export_map, export_note, require_libraries
+from taichi_mrf.export.formats import export_map, export_note, require_libraries
 from taichi_mrf.methods.capabilities import can_freeze, has_layers
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import in_chunks, take_part
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.system.files import exists, is_file, is_folder
@@ -90,7 +91,7 @@ def _nearest_folder(path: Path) -> Path:
     return next(parent for parent in path.absolute().parents if exists(parent))
 
 
-def _export(m: ExportedMap, staged: Path, path: Path, options: Export) -> list[Path]:
+def _export(m: VoxelMap, staged: Path, path: Path, options: Export) -> list[Path]:
     """Make one file; an error names the place that it is for."""
     try:
         return export_map(m, staged, options.options)
@@ -104,7 +105,7 @@ def _move(file: Path, place: Path) -> None:
         os.replace(file, temporary)
 
 
-def _opened(options: Export) -> ExportedMap:
+def _opened(options: Export) -> VoxelMap:
     """The map, the part of a map in chunks, or the layer of a map that was asked for."""
     layered = options.layer != "both" or options.at is not None
     if options.map.suffix == SUFFIX:
@@ -125,7 +126,7 @@ def _opened(options: Export) -> ExportedMap:
     return _layer(m, options) if layered else m
 
 
-def _layer(m: OccupancyMap, options: Export) -> ExportedMap:
+def _layer(m: OccupancyMap, options: Export) -> VoxelMap:
     """The layer of a map, as of the time that was asked for."""
     if not has_layers(m):
         able = methods_with("has_layers")

@@ -10,17 +10,17 @@ are here, and rays without an answer are counted as wrong and reported.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.evaluation.held_out import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import Answer, View
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
 
@@ -45,20 +45,6 @@ MISSED = 0.2
 
 SURFACE_STD = 0.25
 """Standard deviation of the measured surface in voxels, as its weights have it (docs/surfaces.md)."""
-
-
-class JudgedMap(Protocol):
-    """The part of a map that the metric uses."""
-
-    @property
-    def voxel_size(self) -> float: ...
-    @property
-    def view(self) -> View: ...
-    @property
-    def sensor(self) -> SensorConfig: ...
-    def measured_depth(
-        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
-    ) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)
@@ -188,7 +174,7 @@ class JudgedView:
 
 
 def judge_view(
-    m: JudgedMap,
+    m: VoxelMap,
     depth_m: ArrayLike,
     T_world_camera: ArrayLike,
     camera: Camera,
@@ -242,7 +228,7 @@ def judge_view(
 
 
 def accuracy(
-    m: JudgedMap,
+    m: VoxelMap,
     depth_m: ArrayLike,
     T_world_camera: ArrayLike,
     camera: Camera,

@@ -4,16 +4,20 @@ it renders.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import PosedDepth
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, without_bias
+
+Render = Callable[[Camera, Pose], NDArray[np.float32]]
+"""Predicts axial depth (H, W) at a pose, NaN where there is none."""
 
 
 @dataclass(frozen=True)
@@ -90,33 +94,20 @@ class HeldOutCheck:
     skipped: dict[str, str]
 
 
-class RenderedMap(Protocol):
-    """A map that predicts depth."""
-
-    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]: ...
-
-
-class NoisyMap(RenderedMap, Protocol):
-    """A map that predicts depth and knows its noise."""
-
-    @property
-    def noise(self) -> NoiseModel: ...
-
-
 def check_held_out(
-    m: NoisyMap,
+    m: VoxelMap,
     dataset: Dataset,
     held_out: Sequence[int],
     on_frame: Callable[[int], None] = lambda number: None,
-    rendered_by: RenderedMap | None = None,
+    render: Render | None = None,
 ) -> HeldOutCheck:
     """Compare the depth that a map predicts at held-out views with the depth measured there, of which the
     sensor's bias is taken.
 
     ``held_out`` are indices of the dataset. ``on_frame`` is called after each with its number from 1.
-    ``rendered_by`` renders in place of the map.
+    ``render`` predicts depth in place of the map's own ``render_depth``.
     """
-    mapped = m if rendered_by is None else rendered_by
+    predicted = render or m.render_depth
     skipped: dict[str, str] = {}
 
     def depth_pairs() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float64]]]:
@@ -126,7 +117,7 @@ def check_held_out(
             except FrameError as error:
                 skipped[dataset.frame_names[index]] = str(error)
             else:
-                yield mapped.render_depth(frame.camera, frame.T_world_camera), surface_depth(frame, m.noise)
+                yield predicted(frame.camera, frame.T_world_camera), surface_depth(frame, m.noise)
             on_frame(number)
 
     error = pooled_depth_error(depth_pairs())

@@ -16,14 +16,14 @@ nor always in which of two neighbours. The variance of a place that may be anywh
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.accuracy import JudgedMap, judge_view
+from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
@@ -86,7 +86,7 @@ class Explained:
 
 
 def explained(
-    m: JudgedMap,
+    m: VoxelMap,
     depth_m: NDArray[np.float32],
     T_world_camera: ArrayLike,
     camera: Camera,
@@ -196,13 +196,6 @@ LEAST_GAIN = 0.02
 sigma, no factor on it makes a difference. Right noises came out at up to .004, the kitchen's at .05."""
 
 
-class NoisyMap(JudgedMap, Protocol):
-    """A map that knows its noise."""
-
-    @property
-    def noise(self) -> NoiseModel: ...
-
-
 @dataclass(frozen=True)
 class NoiseCheck:
     """``factor`` is what sigma has to be multiplied by so that ``pixels`` measurements of ``frames`` held-out
@@ -222,7 +215,7 @@ class NoiseCheck:
 
 
 def check_noise(
-    m: NoisyMap,
+    m: VoxelMap,
     dataset: Dataset,
     held_out: Sequence[int],
     on_frame: Callable[[], None] = lambda: None,
@@ -260,7 +253,7 @@ def checked(measured: Explained, frames: int, most: float = DOUBTED) -> NoiseChe
     return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by) if wrong else None)
 
 
-def explained_frame(m: NoisyMap, frame: Frame) -> Explained | None:
+def explained_frame(m: VoxelMap, frame: Frame) -> Explained | None:
     """How well a map explains a frame that it has not seen, by the noise that both state."""
     noise = frame.own_for(m.sensor).noise_model(m.noise, frame.depth_m)
     plain = replace(m.sensor, sigma_scale=1.0, sigma_added=0.0)

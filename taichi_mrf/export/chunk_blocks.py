@@ -1,18 +1,15 @@
 """Writes a map in memory to a store, layer by layer."""
 
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
-from taichi_mrf.export.fused_surface import SurfacedMap
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.queries.colored import ColoredMap
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, known_bricks
 from taichi_mrf.queries.points import OCCUPIED, classify
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layers import (
     COLORS,
     FIRST,
@@ -24,19 +21,7 @@ from taichi_mrf.voxels.layers import (
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, by_chunk
 
 
-class StorableMap(QueriedMap, Protocol):
-    """A map in memory that can be written to a store."""
-
-    @property
-    def config(self) -> Config: ...
-
-    @property
-    def seen_free_log_odds(self) -> float:
-        """Log-odds of a place that rays cross but that has no brick."""
-        ...
-
-
-def header_of(m: StorableMap, up: Up | None = None) -> StoreHeader:
+def header_of(m: VoxelMap, up: Up | None = None) -> StoreHeader:
     """The header of a map's store; ``up`` (default: the map's) is kept in it."""
     prior, volume = m.view.pool.prior_log_odds, m.view.volume
     return StoreHeader.of(m.config, prior, m.seen_free_log_odds, volume.min_evidence, up or m.up)
@@ -44,10 +29,10 @@ def header_of(m: StorableMap, up: Up | None = None) -> StoreHeader:
 
 def write_chunks(
     path: str | Path,
-    m: StorableMap,
+    m: VoxelMap,
     up: Up | None = None,
-    colored: ColoredMap | None = None,
-    measured: SurfacedMap | None = None,
+    colored: VoxelMap | None = None,
+    measured: VoxelMap | None = None,
 ) -> None:
     """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it, the
     colours of ``colored``, what the rays of ``measured`` say of the surface (both the same map or None), and

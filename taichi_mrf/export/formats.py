@@ -11,7 +11,7 @@ the map's origin is in the recorded world, unless that is 0.
 import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from taichi_mrf.config.arguments import shown
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
-from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
+from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
-from taichi_mrf.export.fused_surface import SurfacedMap, has_surface, measured_surface
+from taichi_mrf.export.fused_surface import measured_surface
 from taichi_mrf.export.map_server import grey_image, level_map, write_map_server
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
@@ -30,9 +30,10 @@ from taichi_mrf.export.surface import Surface, photographed, smooth_surface, vox
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
 from taichi_mrf.queries.cells import standing_cells
-from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.colored import shown_colors
+from taichi_mrf.queries.known_bricks import BrickReader, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path, write_npz
 from taichi_mrf.system.libraries import library
 from taichi_mrf.system.memory import check_memory
@@ -49,22 +50,11 @@ NO_SURFACE = (
 _BYTES_PER_VOXEL = 40
 
 
-class ExportedMap(StorableMap, Protocol):
-    """The parts of a map that exports use; all maps of methods/protocol.py have them."""
-
-    @property
-    def decided(self) -> "ExportedMap":
-        """The map by what is occupied."""
-        ...
-
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
-
-
-Writer = Callable[[ExportedMap, Path, ExportOptions], list[Path]]
+Writer = Callable[[VoxelMap, Path, ExportOptions], list[Path]]
 """Writes a map to a file, and returns the files that were written."""
 
 
-def export_map(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> list[Path]:
+def export_map(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> list[Path]:
     """Write a map to a file, in the format of its extension.
 
     ``m`` is any map, or a part of a chunked map (:func:`take_part`). The formats are ``.ply`` (points, or a
@@ -113,7 +103,7 @@ def extensions() -> Sequence[str]:
     return tuple(_WRITERS)
 
 
-def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
+def export_note(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
     """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world, and that
     its coordinates are not the recording's, if that is so."""
     origin, suffix = m.config.volume.origin, Path(path).suffix.lower()
@@ -122,7 +112,7 @@ def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFA
     return "; ".join(filter(None, [_shown_note(m, path, options), told if local else None])) or None
 
 
-def _shown_note(m: ExportedMap, path: str | Path, options: ExportOptions) -> str | None:
+def _shown_note(m: VoxelMap, path: str | Path, options: ExportOptions) -> str | None:
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is _surface or (writer is _points_or_surface and options.mesh):
         if options.cubes or not hasattr(m, "has_surface"):
@@ -142,7 +132,7 @@ def _shown_note(m: ExportedMap, path: str | Path, options: ExportOptions) -> str
     return f"{_plan_note(_up(m, options))} ({reason})"
 
 
-def _up(m: ExportedMap, options: ExportOptions) -> Up:
+def _up(m: VoxelMap, options: ExportOptions) -> Up:
     return m.up or Z_UP if options.up == "auto" else up_from_name(options.up)
 
 
@@ -151,7 +141,7 @@ def _plan_note(up: Up) -> str:
     return f"up is {up_name(up)}: columns run along {right}, rows from the bottom along {forwards}"
 
 
-def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _points_or_surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes or options.mesh:
         return _surface(m, path, options)
     m = m.decided
@@ -168,7 +158,7 @@ def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> li
     return [path]
 
 
-def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes:
         surface = voxel_surface(m.decided, options.threshold, options.cells)
     elif (measured := _with_rays(m, path, options)) is not None:
@@ -185,35 +175,35 @@ def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     return [path]
 
 
-def _with_rays(m: ExportedMap, path: Path, options: ExportOptions) -> SurfacedMap | None:
+def _with_rays(m: VoxelMap, path: Path, options: ExportOptions) -> VoxelMap | None:
     """The map, if its mesh is to be what rays measured. Raises ConfigError if it has none."""
-    if options.surface != "marginal" and has_surface(m):
+    if options.surface != "marginal" and m.has_surface:
         return m
     if options.surface == "rays":
         raise ConfigError(f"{path}: {NO_SURFACE}; --surface marginal needs none")
     return None
 
 
-def _photo(m: ExportedMap, path: Path, options: ExportOptions) -> ColoredMap | None:
+def _photo(m: VoxelMap, path: Path, options: ExportOptions) -> VoxelMap | None:
     """The map, if its colours are to be those that cameras saw. Raises ConfigError if it has none."""
-    if is_colored(m) and options.color_by != "marginal":
+    if m.has_colors and options.color_by != "marginal":
         return m
     if options.color_by == "photo":
         raise ConfigError(f"{path}: the map has no colours: map the recording with --color")
     return None
 
 
-def _octomap_binary(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _octomap_binary(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     write_bt(path, m.decided, options.cells)
     return [path]
 
 
-def _octomap(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _octomap(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     write_ot(path, m.decided, _photo(m, path, options), options.cells)
     return [path]
 
 
-def _level_map(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _level_map(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     up = _up(m, options)
     found = level_map(m.decided, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
     image = grey_image(found.state == OCCUPIED, found.state != UNKNOWN)
@@ -222,12 +212,12 @@ def _level_map(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]
     return write_map_server(path.parent, image, found.cell_size, corner_m, path.stem, _plan_note(up))
 
 
-def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _arrays(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     write_arrays(path, m)
     return [path]
 
 
-def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _chunks(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     kept = options.surface == "rays" or (options.surface == "auto" and m.config.keep_surface)
     measured = _with_rays(m, path, options) if kept else None
     up = _up(m, options) if options.up != "auto" else None
@@ -235,7 +225,7 @@ def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     return [path]
 
 
-def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+def _page(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     from taichi_mrf.export.page import write_page  # viser takes a second to import
 
     write_page(path, m.decided, options.threshold, _up(m, options), _photo(m, path, options), options.cells)
@@ -298,7 +288,7 @@ def write_mesh(
         temporary.write_bytes(content.encode("ascii") if isinstance(content, str) else content)
 
 
-def write_arrays(path: str | Path, m: QueriedMap) -> None:
+def write_arrays(path: str | Path, m: VoxelMap) -> None:
     """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
     reader, deciding = BrickReader(m), BrickReader(m.decided)
     count = len(reader.bricks) * VOXELS

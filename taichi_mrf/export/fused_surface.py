@@ -9,7 +9,6 @@ It goes chunk by chunk, so that memory is bounded by the surface, not by the spa
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +17,8 @@ from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
 from taichi_mrf.export.surface import Surface, welded_rows
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.colored import marginals_behind
-from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
+from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.voxels.colors import marginal_colors
 from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, MARGIN, DistanceSource, blended_sums
@@ -67,29 +67,7 @@ class FusedSurface:
         return MeshScene(TriangleMesh(self.vertices_m, self.triangles.astype(np.int32)))
 
 
-class SurfacedMap(QueriedMap, Protocol):
-    """A map that holds what its keyframes measured of the surface."""
-
-    @property
-    def has_surface(self) -> bool:
-        """True if it holds the surface of all keyframes that it was made of."""
-        ...
-
-    def surface(self) -> FusedSurface:
-        """The surface that the keyframes measured."""
-        ...
-
-    def surface_field(self) -> DistanceSource:
-        """The signed distances that they measured."""
-        ...
-
-
-def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
-    """True if a map holds the measured surface of all keyframes that it was made of."""
-    return bool(getattr(m, "has_surface", False))
-
-
-def measured_surface(m: SurfacedMap) -> Surface:
+def measured_surface(m: VoxelMap) -> Surface:
     """The surface of a map, in the colours of the likeliest marginal at or right behind each vertex."""
     found = m.surface()
     p = marginals_behind(m, found.vertices_m, found.normals)
@@ -131,21 +109,20 @@ def fused_surface(
     return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
 
 
-class _Believing(Protocol):
-    voxel_size: float
-
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
-
-
-def without_free(m: _Believing, surface: FusedSurface, least: float) -> FusedSurface:
+def without_free(
+    surface: FusedSurface,
+    voxel_size: float,
+    occupancy: Callable[[NDArray[np.float64]], NDArray[np.float32]],
+    least: float,
+) -> FusedSurface:
     """The surface without what the map takes for free: vertices around which, within 2 voxels along the
-    normal, no voxel has the probability ``least``. Rays with a large sigma leave such vertices in front of a
-    surface and behind it."""
-    step = m.voxel_size * surface.normals
+    normal, no voxel has the ``occupancy`` ``least``. Rays with a large sigma leave such vertices in front of
+    a surface and behind it."""
+    step = voxel_size * surface.normals
     likely = np.zeros(len(step), bool)
     for number in (0, -1, 1, -2, 2):
         rows = np.flatnonzero(~likely)
-        likely[rows] = m.occupancy(surface.vertices_m[rows] + number * step[rows]) >= least
+        likely[rows] = occupancy(surface.vertices_m[rows] + number * step[rows]) >= least
     return _of_triangles(surface, np.asarray(likely[surface.triangles].all(axis=1)))
 
 

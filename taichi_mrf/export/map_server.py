@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_name
 from taichi_mrf.queries.box import map_extent
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, known_bricks
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path, write_text
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
@@ -76,7 +77,7 @@ class LevelMap:
 
 
 def level_map(
-    m: QueriedMap,
+    m: VoxelMap,
     z_min: float | None,
     z_max: float | None,
     occupied_from: float = 0.5,
@@ -118,7 +119,7 @@ def level_map(
     return LevelMap(state, np.maximum(highest, 0), (float(corner[0]), float(corner[1])), m.voxel_size, axes)
 
 
-def _heights(m: QueriedMap, up: Up) -> str:
+def _heights(m: VoxelMap, up: Up) -> str:
     """Between which heights something is known, in words."""
     axis, sign = up
     layers = set()

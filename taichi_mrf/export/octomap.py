@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.queries.cells import SUREST, standing_in
-from taichi_mrf.queries.colored import ColoredMap
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
@@ -92,7 +92,7 @@ class Nodes:
 
 
 def octree_of(
-    m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = None, cells: bool = False
+    m: VoxelMap, *, only_state: bool, colored: VoxelMap | None = None, cells: bool = False
 ) -> Nodes:
     """The known space of a map in pre-order: no node for unknown space, leaves for free space, with or
     without voxels in the map, and for what is occupied. Eight equal leaves are one.
@@ -278,7 +278,7 @@ COLOR_NODE = np.dtype([("value", "<f4"), ("color", "u1", 3), ("children", "u1")]
 """A node of an ``.ot`` of the kind ColorOcTree."""
 
 
-def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None, cells: bool = False) -> None:
+def write_ot(path: str | Path, m: VoxelMap, colored: VoxelMap | None = None, cells: bool = False) -> None:
     """Write a map with its log-odds, as a ColorOcTree with the colours of ``colored``, the same map; unknown
     stays unknown. With ``cells``, larger leaves stand in for voxels none of which is likely occupied
     (octree.octree_of). Raises MapFileError, CapacityError."""
@@ -291,7 +291,7 @@ def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None,
     _write(path, FULL_HEADER, nodes, m.voxel_size, records.tobytes(), kind)
 
 
-def write_bt(path: str | Path, m: QueriedMap, cells: bool = False) -> None:
+def write_bt(path: str | Path, m: VoxelMap, cells: bool = False) -> None:
     """Write which voxels are free and which occupied, the rest being unknown; ``cells`` as in
     :func:`write_ot`. Raises MapFileError, CapacityError."""
     nodes = octree_of(m, only_state=True, cells=cells)

@@ -12,8 +12,9 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Z_UP, Up
-from taichi_mrf.queries.colored import ColoredMap, shown_colors_in
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
+from taichi_mrf.queries.colored import shown_colors_in
+from taichi_mrf.queries.known_bricks import BrickReader
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import ColorBy, ViewOptions, probabilities, voxel_colors
@@ -32,10 +33,10 @@ _NOT_SHOWN = np.float32(-60)
 
 def write_page(
     path: str | Path,
-    m: QueriedMap,
+    m: VoxelMap,
     threshold: float = 0.5,
     up: Up | None = None,
-    colored: ColoredMap | None = None,
+    colored: VoxelMap | None = None,
     cells: bool = False,
 ) -> None:
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the

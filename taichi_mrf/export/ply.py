@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.queries.change import STATES, MapChange
-from taichi_mrf.queries.colored import is_colored, shown_colors
-from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.colored import shown_colors
 from taichi_mrf.queries.points import OCCUPIED
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 
@@ -51,9 +51,9 @@ def write_voxels(
     write_points(path, centres, shown, extra, comments, origin_m)
 
 
-def photo_at(m: QueriedMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
+def photo_at(m: VoxelMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
     """Colours that cameras saw at points (N, 3) in metres, for :func:`write_voxels`; None without any."""
-    return shown_colors(m, points) if is_colored(m) else None
+    return shown_colors(m, points) if m.has_colors else None
 
 
 def write_points(

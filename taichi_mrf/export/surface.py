@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
 from taichi_mrf.queries.cells import CellReader
-from taichi_mrf.queries.colored import ColoredMap, blended_colors, shown_colors
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
+from taichi_mrf.queries.colored import blended_colors, shown_colors
+from taichi_mrf.queries.known_bricks import BrickReader, sorted_bricks
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
@@ -48,7 +49,7 @@ class Surface:
     std_m: NDArray[np.float32] | None = None
 
 
-def voxel_surface(m: QueriedMap, threshold: float, cells: bool = False) -> Surface:
+def voxel_surface(m: VoxelMap, threshold: float, cells: bool = False) -> Surface:
     """The outsides of all voxels of at least this probability, with ``cells`` also of those in cells that
     stand in for voxels (queries/cells.py); each side has its own four vertices."""
     corners, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
@@ -71,7 +72,7 @@ def voxel_surface(m: QueriedMap, threshold: float, cells: bool = False) -> Surfa
     return Surface(vertices, triangles, np.concatenate(colors))
 
 
-def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
+def photographed(m: VoxelMap, surface: Surface, of_voxels: bool) -> Surface:
     """The surface in the colours that cameras saw. ``of_voxels``: it is a :func:`voxel_surface`."""
     if of_voxels:
         corners = surface.vertices_m.reshape(-1, 4, 3)
@@ -83,7 +84,7 @@ def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
     return replace(surface, colors=colors, colors_note=PHOTO_NOTE)
 
 
-def smooth_surface(m: QueriedMap, level: float) -> Surface:
+def smooth_surface(m: VoxelMap, level: float) -> Surface:
     """Surface where the marginal is ``level``: marching cubes (Lewiner et al. 2003) between voxels' centres.
     Unknown space counts as empty."""
     from skimage import measure  # slow to import
@@ -118,7 +119,7 @@ def _largest_around(points: NDArray[np.float32], p: NDArray[np.float32]) -> NDAr
     return np.max([p[tuple(corner)] for corner in corners], axis=0)
 
 
-def _chunks(m: QueriedMap, margin: int, reach_back: bool, reader: BrickReader) -> Iterator[BoxOfVoxels]:
+def _chunks(m: VoxelMap, margin: int, reach_back: bool, reader: BrickReader) -> Iterator[BoxOfVoxels]:
     """The chunks that hold voxels, with ``margin`` voxels around them, or with ``reach_back`` one voxel more
     behind them, and with them the chunks before them, whose cells reach into them.
 
@@ -135,7 +136,7 @@ def _chunks(m: QueriedMap, margin: int, reach_back: bool, reader: BrickReader) -
         yield voxel_box(m, first - margin, first + CHUNK_VOXELS + max(margin, int(reach_back)), reader)
 
 
-def _seen_probability(m: QueriedMap, found: BoxOfVoxels) -> NDArray[np.float32]:
+def _seen_probability(m: VoxelMap, found: BoxOfVoxels) -> NDArray[np.float32]:
     """Marginals, 0 for unknown voxels: their prior may be one half, which is no surface."""
     return np.where(found.log_odds == m.view.pool.prior_log_odds, np.float32(0), found.occupancy)
 

@@ -15,9 +15,8 @@ message for each voxel that it sees, and a sweep over it is four steps:
     backward   the message of the ray to each voxel                                        (13), (14)
     finish     average over rays, renew the keyframe's message, update the beliefs          (7), (8)
 
-Messages and beliefs are log-odds. A voxel counts by the length l (in voxel sizes) that a ray spends in it: it
-lets the ray pass with probability (1 - m)^l where m is its probability of being occupied. In the symbols of
-section III, for the voxels 1 .. N of one ray, ordered from the camera:
+Messages and beliefs are log-odds. A ray that spends the length l (in voxel sizes) in a voxel passes it with
+probability (1 - m)^l. In the symbols of section III, for the voxels 1 .. N of one ray from the camera on:
 
     m_i         cavity probability of occupied      exp(log_free) = 1 - m_i, or 1 - (1 - s) m_i
     nu_i        likelihood of the measurement if voxel i is the first surface                   (4)
@@ -25,9 +24,8 @@ section III, for the voxels 1 .. N of one ray, ordered from the camera:
     before_i    sum_{j<i} nu_j m_j vis_j                                         ForwardPass.explained
     behind_i    sum_{j>i} nu_j m_j vis_j, and what lies beyond the map
 
-What is in a voxel may fill only a part of it. With the chance s that a ray passes through an occupied voxel
-(``pass_through``), m becomes (1 - s) m in all of these, and a voxel's message for occupied has the share s of
-that for empty. In the paper s is 0.
+With the chance s that a ray passes through an occupied voxel (``pass_through``; 0 in the paper), m becomes
+(1 - s) m in all of these, and a voxel's message for occupied has the share s of that for empty.
 """
 
 from dataclasses import dataclass
@@ -91,7 +89,7 @@ def cavity(
     slots: I32Array, belief: F32Array, messages: AnyArray, lowest: F32, highest: F32,
     log_pass: F32, passes: Template, log_free: F32Array, sums: I64Array, strip: Template,
 ) -> None:  # fmt: skip
-    """Eq. 6: the belief of each voxel without this keyframe's own message.
+    """Step 3, eq. 6: the belief of each voxel without this keyframe's own message.
 
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) log-odds and
     ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - (1 - s) m) to ``log_free`` (n * 512),
@@ -146,7 +144,8 @@ def send_messages(
                     begin = entry_depths[i]
                 clip(ray, begin, end, space.lower, space.upper)
 
-                # Forward: eqs. 4 and 11 for each voxel, from the camera outwards.
+                # Step 4, forward, eqs. 4 and 11, from the camera outwards:
+                # before_i = sum_{j<i} nu_j m_j vis_j, vis_i = prod_{k<i} (1 - m_k)^l_k.
                 ahead = ForwardPass(1.0, 0.0, end, 0)
                 first_step = worker * trace.longest
                 walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
@@ -159,7 +158,8 @@ def send_messages(
                 if end < last:
                     behind = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
 
-                # Backward: eqs. 13 and 14 for each voxel, from the far end.
+                # Step 5, backward, eqs. 13 and 14, from the far end: occupied = before_i + nu_i vis_i,
+                # empty = before_i + behind_i / (1 - m_i)^l_i, and log(occupied / empty) is sent.
                 for step in range(ahead.voxels):
                     j = first_step + ahead.voxels - 1 - step
                     weight, free = trace.step[j][0], trace.step[j][1]
@@ -258,7 +258,7 @@ def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
     clamp: F32, least_length: F32, moved: I32Array, strip: Template,
 ) -> None:  # fmt: skip
-    """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
+    """Step 6: renew a keyframe's messages with the rays' averages, eq. 7, and with them the beliefs, eq. 8.
 
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) and ``messages`` (n *
     512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``least_length`` voxel

@@ -118,9 +118,9 @@ class Sweeper:
             return False
         messages, bricks, model = keyframe.messages, visible.on_device(), self.model()
 
-        # Eq. 6: the belief of each voxel without this keyframe's message.
+        # Step 3, cavity, eq. 6: log-odds(m) = belief - own message, of each voxel.
         with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
-            # Eqs. 4, 11, 13 and 14: the rays' messages.
+            # Step 4, forward, eqs. 4 and 11, and step 5, backward, eqs. 13 and 14: each ray's messages.
             if keyframe.no_returns is not None:
                 parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers)
                 send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
@@ -135,7 +135,7 @@ class Sweeper:
                     cast.swept.scale, limits.length,
                 )  # fmt: skip
 
-        # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
+        # Step 6, finish, eqs. 7 and 8: new message = mean over rays, belief += new - old.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
             bricks.slots, pool.total, messages, cast.swept.sums, cast.swept.scale, limits.message,

@@ -14,17 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import instance, iterable, real, seconds, whole
 from taichi_mrf.config.method import Method
+from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.config.values import overridden
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.queries.points import classify, point_log_odds, probability
+from taichi_mrf.queries.points import checked_points, classify, point_log_odds, probability
 from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.queries.view import Answer, RayProfile, View
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
@@ -32,6 +35,8 @@ from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.later import later
 from taichi_mrf.system.owner import Owned, owned_attribute
+from taichi_mrf.voxels.distance_field import DistanceSource
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology, create_topology, recycle
 
@@ -220,6 +225,35 @@ class BrickMap(Owned):
         """The surface that keyframes measured, as rays meet it; None in maps without one."""
         return None
 
+    @property
+    def has_colors(self) -> bool:
+        """True if any voxel may have a colour."""
+        return False
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours at (N, 3) points in metres, (N, 4): red, green, blue, and how much was seen; 0 for none."""
+        return np.zeros((len(checked_points(points)), 4), np.uint8)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
+        return np.zeros((len(slots), VOXELS, 4), np.uint8)
+
+    @property
+    def has_surface(self) -> bool:
+        """True if the map holds the surface of all keyframes that it was made of."""
+        return False
+
+    def surface(self) -> Any:
+        """The surface that keyframes measured. Raises ConfigError in a map without one."""
+        raise ConfigError(
+            f"a map of the method {self.METHOD.name} does not measure surfaces: "
+            f"{methods_with('measures_surface')} does"
+        )
+
+    def surface_field(self) -> DistanceSource:
+        """The signed distances that keyframes measured. Raises ConfigError in a map without them."""
+        raise ConfigError(f"a map of the method {self.METHOD.name} does not measure surfaces")
+
     @tensors.in_kind("origin", "direction")
     def ray_profile(
         self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
@@ -232,7 +266,7 @@ class BrickMap(Owned):
 
     @tensors.in_kind("depth_m", "T_world_camera")
     def ray_scores(
-        self,
+        self: VoxelMap,
         depth_m: ArrayLike,
         T_world_camera: ArrayLike,
         camera: Camera,

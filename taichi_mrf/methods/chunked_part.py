@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.schema import Config
+from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, within_voxels, without_free
 from taichi_mrf.geometry.poses import as_pose
@@ -19,11 +19,13 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.colored import blended_colors
-from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader, Placed
+from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader
 from taichi_mrf.queries.points import checked_points
-from taichi_mrf.queries.view import View
+from taichi_mrf.queries.view import Answer, View
+from taichi_mrf.queries.voxel_map import Placed
 from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import owned_attribute
@@ -63,9 +65,33 @@ class MapPart:
         return self.source.header.seen_free_log_odds
 
     @property
+    def sensor(self) -> SensorConfig:
+        """The parameters of the sensor."""
+        return self.source.config.sensor
+
+    @property
+    def noise(self) -> NoiseModel:
+        """The noise that these parameters describe."""
+        return PolynomialNoise(self.sensor.sigma, self.sensor.bias)
+
+    @property
     def up(self) -> Up | None:
         """The world axis that is up, None if the store does not hold it."""
         return self.source.up
+
+    @tensors.in_kind("T_world_camera")
+    def render_depth(
+        self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "omega"
+    ) -> NDArray[np.float32]:
+        """Axial depth (H, W) of the middle of the voxel that each pixel most likely sees; NaN for none."""
+        check_camera(camera)
+        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
+
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        """NaN everywhere (H, W): the measured surface is not looked for."""
+        return np.full(camera.shape, np.nan, np.float32)
 
     @tensors.in_kind("points")
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
@@ -142,7 +168,7 @@ class MapPart:
         first, after = self.lowest * BRICK, self.after * BRICK
         distances = self.source.distances(first - _MARGIN, after + _MARGIN)
         found = fused_surface(distances, self.voxel_size)
-        found = without_free(self.source, found, LEAST * self.source.prior)
+        found = without_free(found, self.voxel_size, self.source.occupancy, LEAST * self.source.prior)
         found = within_voxels(found, self.voxel_size, first, after)
         return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
 
@@ -182,24 +208,18 @@ class _PartIndex:
         return np.isin(grid_keys(bricks), self._free).astype(np.int32)
 
 
-@dataclass(frozen=True)
-class ChunkedViews:
-    """Renders a chunked map, whose parts are loaded as they come into view."""
-
-    source: ChunkedMap
-
-    @tensors.in_kind("T_world_camera")
-    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """As OccupancyMap.render_depth; the map may be larger than memory, what is in view may not."""
-        check_camera(camera)
-        T, max_depth = as_pose(T_world_camera), self.source.config.sensor.max_depth
-        ends = camera.rays().reshape(-1, 3).astype(np.float64) * max_depth @ T[:3, :3].T + T[:3, 3]
-        corners = np.concatenate([ends, T[None, :3, 3]])
-        try:
-            part = take_part(self.source, *widened(camera, T, corners.min(axis=0), corners.max(axis=0)))
-        except ConfigError:  # there is no surface in view
-            return np.full(camera.shape, np.nan, np.float32)
-        return part.view.render_depth(camera, T, max_depth)
+def render_chunked(m: ChunkedMap, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+    """Axial depth (H, W) of the surface that each pixel sees, as OccupancyMap.render_depth, of a map that may
+    be larger than memory; the part that is in view may not."""
+    check_camera(camera)
+    T, max_depth = as_pose(T_world_camera), m.config.sensor.max_depth
+    ends = camera.rays().reshape(-1, 3).astype(np.float64) * max_depth @ T[:3, :3].T + T[:3, 3]
+    corners = np.concatenate([ends, T[None, :3, 3]])
+    try:
+        part = take_part(m, *widened(camera, T, corners.min(axis=0), corners.max(axis=0)))
+    except ConfigError:  # there is no surface in view
+        return np.full(camera.shape, np.nan, np.float32)
+    return part.render_depth(camera, T)
 
 
 def in_chunks(m: OccupancyMap) -> ChunkedMap | None:

@@ -3,17 +3,16 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.method import Method
-from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
-from taichi_mrf.queries.view import Answer, RayProfile, View
+from taichi_mrf.queries.view import RayProfile
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel
@@ -94,7 +93,7 @@ class MappedKeyframe(PosedDepth, Protocol):
         ...
 
 
-class OccupancyMap(Protocol):
+class OccupancyMap(VoxelMap, Protocol):
     """A probabilistic occupancy map of depth keyframes, whatever its method.
 
     Until :meth:`infer`, queries after a change return what was computed before.
@@ -103,23 +102,8 @@ class OccupancyMap(Protocol):
     METHOD: ClassVar[Method]
     """The method's entry, which says what else the map can do (capabilities.py)."""
 
-    config: Config
-    sensor: SensorConfig
-    noise: NoiseModel
-    voxel_size: float
-    view: View
-    """Follows rays through the map."""
-    seen_free_log_odds: float
-    """Log-odds of a place that rays cross but that has no brick."""
-
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]: ...
-
-    @property
-    def up(self) -> Up | None:
-        """The world axis that is up in the image of the first keyframe that was added, which may have been
-        removed since; None before it."""
-        ...
 
     @property
     def stale(self) -> bool:
@@ -191,45 +175,6 @@ class OccupancyMap(Protocol):
     ) -> InferSteps:
         """:meth:`infer` as a generator, which yields after each keyframe. Between two steps the map may be
         queried but not changed."""
-        ...
-
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32."""
-        ...
-
-    def state(self, points: ArrayLike) -> NDArray[np.int8]:
-        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        ...
-
-    @property
-    def decided(self) -> Any:
-        """The map whose log-odds say which voxels are occupied, perhaps this one; it can be queried and
-        exported, but not changed."""
-        ...
-
-    def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
-        """The probability that something lies within ``radius_m`` of points (N, 3), in metres: (N,)."""
-        ...
-
-    def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
-        """The probability that a ball hits something on a path (N, 3) -> (), or paths (P, N, 3) -> (P,)."""
-        ...
-
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
-        ...
-
-    def render_depth(
-        self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "surface"
-    ) -> NDArray[np.float32]:
-        """Axial depth of the surface that each pixel most likely sees, (H, W) float32, NaN where there is
-        none: the measured one near the likeliest voxel, or ``by="omega"`` the middle of that voxel."""
-        ...
-
-    def measured_depth(
-        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
-    ) -> NDArray[np.float32]:
-        """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, NaN elsewhere."""
         ...
 
     def ray_profile(

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import Z_UP, plan_axes
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, bricks_between, known_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, bricks_between, known_bricks
 from taichi_mrf.queries.points import probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.system.tensors import on_host
 from taichi_mrf.voxels.layout import BRICK
@@ -61,7 +62,7 @@ class BoxOfVoxels:
         ) * self.voxel_size
 
 
-def read_box(m: QueriedMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
+def read_box(m: VoxelMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
     """The voxels that a box reaches into, from corner ``lower`` to corner ``upper``, (3,) in metres.
 
     Raises ConfigError for corners that make no box, CapacityError if it holds more voxels than fit memory.
@@ -69,7 +70,7 @@ def read_box(m: QueriedMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
     return voxel_box(m, *voxels_of_box(lower, upper, m.voxel_size))
 
 
-def map_extent(m: QueriedMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def map_extent(m: VoxelMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two corners, (3,) in metres, of the box around all that is known in the map; it ends at bricks of
     8 voxels. Raises ConfigError for an empty map."""
     bricks = known_bricks(m)
@@ -97,7 +98,7 @@ def voxels_of_box(
 
 
 def voxel_box(
-    m: QueriedMap, first: NDArray[np.int64], after: NDArray[np.int64], reader: BrickReader | None = None
+    m: VoxelMap, first: NDArray[np.int64], after: NDArray[np.int64], reader: BrickReader | None = None
 ) -> BoxOfVoxels:
     """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each.
 
@@ -145,7 +146,7 @@ class MapSlice:
 
 
 def slice_map(
-    m: QueriedMap,
+    m: VoxelMap,
     at: float,
     axis: Literal["up"] | Axis = "up",
     lower: ArrayLike | None = None,

@@ -10,8 +10,8 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.queries.given_rays import GivenRays, RaySpace, WindowRays
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
@@ -44,7 +44,7 @@ class RayHits:
 
 @tensors.in_kind("origins", "directions", on_device=True)
 def cast_rays(
-    m: QueriedMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
+    m: VoxelMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
 ) -> RayHits:
     """Follow rays to the first voxel that is occupied (:meth:`state`), in one kernel for all of them.
 
@@ -77,7 +77,7 @@ def cast_rays(
 
 
 def _through_voxels(
-    m: QueriedMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
+    m: VoxelMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
 ) -> None:
     """Past everything but occupied voxels: only bricks that exist need to be looked at."""
     filled = m.view.fill(corners, lambda slots: _may_end_rays(m, slots, rays.count))
@@ -90,7 +90,7 @@ def _through_voxels(
 
 
 def _through_space(
-    m: QueriedMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
+    m: VoxelMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
 ) -> None:
     """As far as space is known. A layer of unknown bricks lies around it, so no ray leaves the window."""
     space = RaySpace(m)
@@ -106,7 +106,7 @@ def _through_space(
         runtime.settle()
 
 
-def _may_end_rays(m: QueriedMap, slots: NDArray[np.int32], rays: int) -> NDArray[np.bool_]:
+def _may_end_rays(m: VoxelMap, slots: NDArray[np.int32], rays: int) -> NDArray[np.bool_]:
     """Which of some bricks (n,) hold an occupied voxel: the others are passed in one step. Where rays are
     few, looking would cost more than it saves, and it is all of them."""
     marks = np.ones(len(slots), np.int32)
@@ -118,7 +118,7 @@ def _may_end_rays(m: QueriedMap, slots: NDArray[np.int32], rays: int) -> NDArray
 
 
 def _launch(
-    m: QueriedMap,
+    m: VoxelMap,
     window: Window,
     rays: GivenRays,
     max_range: float,

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks
 from taichi_mrf.queries.points import probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels import cells as rule
 from taichi_mrf.voxels.cells import SIDES, SUREST, lowest_voxels, voxels_of_cells
 from taichi_mrf.voxels.layout import BRICK
@@ -35,7 +36,7 @@ class Cells:
         return (self.lowest.astype(np.float64) + 0.5 * self.side) * voxel_size
 
 
-def all_cells(m: QueriedMap, side: int) -> Cells:
+def all_cells(m: VoxelMap, side: int) -> Cells:
     """All cells of 2, 4 or 8 voxels a side in the bricks of a map that have voxels, unknown voxels at the
     map's prior. Raises ConfigError for another side."""
     if side not in SIDES:
@@ -47,7 +48,7 @@ def all_cells(m: QueriedMap, side: int) -> Cells:
     return _joined(parts)
 
 
-def standing_cells(m: QueriedMap, threshold: float = 0.5) -> list[Cells]:
+def standing_cells(m: VoxelMap, threshold: float = 0.5) -> list[Cells]:
     """The cells that stand in for voxels where none reaches a probability of ``threshold``, by size: a cell
     reaches it, and no voxel and no smaller cell in it does.
 
@@ -68,7 +69,7 @@ def standing_cells(m: QueriedMap, threshold: float = 0.5) -> list[Cells]:
 class CellReader(BrickReader):
     """Reads voxels as those of the cells that stand in for them: their log-odds are the cell's."""
 
-    def __init__(self, m: QueriedMap, threshold: float) -> None:
+    def __init__(self, m: VoxelMap, threshold: float) -> None:
         super().__init__(m)
         self._threshold = threshold
 

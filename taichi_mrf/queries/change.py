@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks, sorted_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 STATES = ("unknown", "free", "occupied")
@@ -64,7 +65,7 @@ class MapChange:
         return self.points[(self.before == OCCUPIED) & (self.after == FREE)]
 
 
-def compare_maps(a: QueriedMap, b: QueriedMap, bricks: Bricks | None = None) -> MapChange:
+def compare_maps(a: VoxelMap, b: VoxelMap, bricks: Bricks | None = None) -> MapChange:
     """Compare two maps over all that is known in either, also seen-free space without voxels; or only in
     ``bricks``, (n, 3) coordinates.
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.change import MapChange
 from taichi_mrf.queries.frontiers import find_clusters
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, rows_around
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -132,7 +132,7 @@ class ChangedThing:
         return 0.5 * (self.lower_m + self.upper_m)
 
 
-def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = CORE_VOXELS) -> MapChange:
+def without_slack(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_VOXELS) -> MapChange:
     """Voxels that appeared or left from map a to map b, without what can be a surface of the other map that
     has shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
     voxels = np.floor(change.points / a.voxel_size).astype(np.int32)

@@ -4,41 +4,18 @@ A colour is four uint8: red, green, blue, and how much of the voxel cameras have
 nothing at all, in which case there is no colour.
 """
 
-from typing import Protocol, TypeGuard
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader, QueriedMap
+from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 _POINTS_AT_ONCE = 1 << 19
 
 
-class ColoredMap(QueriedMap, Protocol):
-    """A map whose voxels have colours."""
-
-    @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour."""
-        ...
-
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours at (N, 3) points in metres, (N, 4)."""
-        ...
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
-        ...
-
-
-def is_colored(m: QueriedMap) -> TypeGuard[ColoredMap]:
-    """True if a map's voxels have colours."""
-    return bool(getattr(m, "has_colors", False))
-
-
-def shown_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
+def shown_colors(m: VoxelMap, points: ArrayLike) -> NDArray[np.uint8]:
     """Colours (N, 3) of the voxels that hold the points (N, 3) in metres, as :func:`shown_colors_in` has
     them."""
     voxels = np.floor(np.asarray(points, np.float64) / m.voxel_size).astype(np.int32)
@@ -56,7 +33,7 @@ def shown_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
     return out
 
 
-def shown_colors_in(m: ColoredMap, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+def shown_colors_in(m: VoxelMap, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Colours to show of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 3)."""
     return painted(m.colors_in(slots))
 
@@ -90,7 +67,7 @@ def _cell_sums(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
     return values
 
 
-def blended_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
+def blended_colors(m: VoxelMap, points: ArrayLike) -> NDArray[np.uint8]:
     """Colours (N, 3) at points (N, 3) in metres, blended from the voxels whose centres are the corners of the
     cube around each; a voxel counts by how near it is and by how much of it was seen. Where none of them has
     a colour it is that of :func:`shown_colors`."""
@@ -99,14 +76,14 @@ def blended_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
     return np.concatenate([np.zeros((0, 3), np.uint8), *(_blended(m, part) for part in parts)])
 
 
-def marginals_behind(m: QueriedMap, points: ArrayLike, normals: ArrayLike) -> NDArray[np.float32]:
+def marginals_behind(m: VoxelMap, points: ArrayLike, normals: ArrayLike) -> NDArray[np.float32]:
     """The likeliest marginal at or half a voxel behind points (N, 3) of a surface, in metres: (N,)."""
     places = np.asarray(points, np.float64)
     behind = places - 0.5 * m.voxel_size * np.asarray(normals)
     return np.maximum(m.occupancy(places), m.occupancy(behind))
 
 
-def _blended(m: ColoredMap, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _blended(m: VoxelMap, points: NDArray[np.float64]) -> NDArray[np.uint8]:
     place = points / m.voxel_size - 0.5
     first = np.floor(place)
     share = place - first

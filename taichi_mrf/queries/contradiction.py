@@ -13,20 +13,16 @@ share of measurements that may come from anywhere. A score is ln p(z | best) - l
 with a sign for which way.
 """
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
-from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.queries.points import UNKNOWN
 from taichi_mrf.queries.survey import SurfaceSurvey
-from taichi_mrf.queries.view import View
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
-from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 
@@ -34,19 +30,8 @@ OUTLIERS = 0.01
 """Share of the measurements that may come from anywhere in the sensor's range (o)."""
 
 
-class MeasuredMap(Protocol):
-    """A map, and the sensor that it was made with."""
-
-    voxel_size: float
-    view: View
-    sensor: SensorConfig
-    noise: NoiseModel
-
-    def state(self, points: ArrayLike) -> NDArray[np.int8]: ...
-
-
 def ray_scores(
-    m: MeasuredMap,
+    m: VoxelMap,
     depth_m: ArrayLike,
     T_world_camera: ArrayLike,
     camera: Camera,

@@ -30,7 +30,7 @@ from taichi_mrf.kernels.types import (
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.distance_bricks import DistanceBricks
 from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid, SpaceRules, UnknownSpace
-from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.owner import Owned
@@ -207,7 +207,7 @@ class DistanceField(Owned):
 
     def __init__(
         self,
-        m: QueriedMap,
+        m: VoxelMap,
         max_distance_m: float,
         unknown: UnknownSpace = "free",
         lower: ArrayLike | None = None,
@@ -244,7 +244,7 @@ class DistanceField(Owned):
         """Bytes of memory that the field takes."""
         return self._bricks.bytes
 
-    def update(self, m: QueriedMap | None = None) -> int:
+    def update(self, m: VoxelMap | None = None) -> int:
         """Follow the map: work out the distances again that have changed with the states of voxels since the
         last call, and return for how many voxels that is so. ``m`` is another map to follow from now on, such
         as a later layer or reading, with voxels of the same size.

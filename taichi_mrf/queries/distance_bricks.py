@@ -27,7 +27,8 @@ from taichi_mrf.queries.distance_grid import (
     keep_classes,
 )
 from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
-from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, seen_free_bricks
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
@@ -72,7 +73,7 @@ class DistanceBricks:
         """Bytes of memory that distances and what they are made of take."""
         return self._capacity * _BYTES_PER_BRICK + 4 * self._codes.size
 
-    def update(self, m: QueriedMap, within: BrickBox | None = None) -> int:
+    def update(self, m: VoxelMap, within: BrickBox | None = None) -> int:
         """Take in the states of the map as they are now; returns how many voxels changed their distance.
 
         ``within``: only bricks in this box count. Raises CapacityError.
@@ -96,7 +97,7 @@ class DistanceBricks:
         runtime.settle()
         return voxels
 
-    def _sources(self, m: QueriedMap, within: BrickBox | None) -> tuple[Bricks, NDArray[np.int32]]:
+    def _sources(self, m: VoxelMap, within: BrickBox | None) -> tuple[Bricks, NDArray[np.int32]]:
         """The bricks (n, 3) that are known now or were at the last update, and where their states are
         (n,)."""
         reader = BrickReader(m)

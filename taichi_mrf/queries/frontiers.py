@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import voxel_box
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, UNKNOWN
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, grid_keys
 
 _HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1
@@ -76,7 +77,7 @@ class Frontiers:
     centroids: NDArray[np.float64]
 
 
-def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
+def find_frontiers(m: VoxelMap, min_voxels: int = 1) -> Frontiers:
     """All free voxels that share a face with an unknown one; those that touch, also at a corner, are one
     cluster. Clusters of less than ``min_voxels`` are left out.
 
@@ -91,7 +92,7 @@ def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
     return Frontiers(points, cluster, sizes, np.stack(sums, axis=1) / np.maximum(sizes, 1)[:, None])
 
 
-def frontier_voxels(m: QueriedMap) -> NDArray[np.int32]:
+def frontier_voxels(m: VoxelMap) -> NDArray[np.int32]:
     """Coordinates (n, 3) of the free voxels that share a face with an unknown one, ascending by chunk."""
     m = m.decided
     reader = BrickReader(m)

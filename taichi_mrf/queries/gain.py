@@ -24,8 +24,8 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.given_rays import RaySpace
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.survey import OPAQUE, Occlusion, occlusion, stopped_share
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.sensor.rays import CameraRays
@@ -39,7 +39,7 @@ _THINNEST = 1e-6
 
 @tensors.in_kind("T_world_camera")
 def view_gain(
-    m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
+    m: VoxelMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float64]:
     """Information gain of views, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
 
@@ -57,7 +57,7 @@ def view_gain(
 
 @tensors.in_kind("T_world_camera")
 def pixel_gain(
-    m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
+    m: VoxelMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float32]:
     """Information gain of each pixel's ray up to an axial depth in metres, (H, W) float32 in bits.
 

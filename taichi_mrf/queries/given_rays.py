@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F64, I32, AnyArray2, DVec3, F32Array, F32Array2, F64Array, Vec3
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, seen_free_bricks
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
@@ -30,7 +31,7 @@ from taichi_mrf.voxels.window import Window
 class RaySpace:
     """A map's known and unknown space. It is good for as long as the map does not change."""
 
-    def __init__(self, m: QueriedMap) -> None:
+    def __init__(self, m: VoxelMap) -> None:
         self.map = m
         self._reader = BrickReader(m)
         self._free = seen_free_bricks(m)

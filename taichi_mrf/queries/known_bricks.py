@@ -2,17 +2,13 @@
 Every mapping method provides what is used here.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Protocol
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config
-from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.points import FREE, classify
-from taichi_mrf.queries.view import View
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
 
 Bricks = NDArray[np.int32]
@@ -25,45 +21,13 @@ _POINTS_AT_ONCE = 1 << 20
 _LEAST_PROBABILITY = 1e-9
 
 
-class Placed(Protocol):
-    """Interface of a keyframe, as queries need it: its pose."""
-
-    @property
-    def T_world_camera(self) -> Pose: ...
-
-
-class QueriedMap(Protocol):
-    """Interface of a map, as queries over space need it; every map of methods/protocol.py has it."""
-
-    voxel_size: float
-    view: View
-
-    @property
-    def config(self) -> Config: ...
-
-    @property
-    def keyframes(self) -> Mapping[int, Placed]: ...
-
-    @property
-    def up(self) -> Up | None: ...
-
-    @property
-    def decided(self) -> "QueriedMap":
-        """The map whose log-odds say which voxels are occupied, perhaps this one."""
-        ...
-
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
-
-    def state(self, points: ArrayLike) -> NDArray[np.int8]: ...
-
-
 class BrickReader:
     """Reads the voxels of bricks by their coordinates, also of those that have no voxels of their own.
 
     It is good for as long as no brick comes or goes.
     """
 
-    def __init__(self, m: QueriedMap) -> None:
+    def __init__(self, m: VoxelMap) -> None:
         self.map, self.pool = m, m.view.pool
         slots = self.pool.in_use
         keys = grid_keys(self.pool.bricks[slots])
@@ -113,7 +77,7 @@ class BrickReader:
         return np.where(free, log_odds, self.pool.prior_log_odds).astype(np.float32)
 
 
-def seen_free_bricks(m: QueriedMap) -> Bricks:
+def seen_free_bricks(m: VoxelMap) -> Bricks:
     """Bricks (n, 3), ascending, that rays have crossed and in which no surface was measured: they are free
     and have no voxels of their own. Maps that integrate scan by scan keep voxels for all they have seen.
 
@@ -132,7 +96,7 @@ def seen_free_bricks(m: QueriedMap) -> Bricks:
         box = np.minimum(box[0], found.min(axis=0)), np.maximum(box[1], found.max(axis=0))
 
 
-def known_bricks(m: QueriedMap) -> Bricks:
+def known_bricks(m: VoxelMap) -> Bricks:
     """All known bricks (n, 3), ascending: those with voxels and the seen-free."""
     return sorted_bricks(np.concatenate([BrickReader(m).bricks, seen_free_bricks(m)]))
 
@@ -147,7 +111,7 @@ def brick_centres(bricks: Bricks, voxel_size: float) -> NDArray[np.float64]:
     return (bricks.astype(np.float64) * BRICK + 0.5 * (BRICK + 1)) * voxel_size
 
 
-def _first_box(m: QueriedMap) -> tuple[Bricks, Bricks] | None:
+def _first_box(m: VoxelMap) -> tuple[Bricks, Bricks] | None:
     """Lowest and highest brick with voxels or with a camera in it."""
     pool = m.view.pool
     brick_m = m.voxel_size * BRICK
@@ -156,7 +120,7 @@ def _first_box(m: QueriedMap) -> tuple[Bricks, Bricks] | None:
     return (places.min(axis=0), places.max(axis=0)) if len(places) else None
 
 
-def _free_without_voxels(m: QueriedMap, reader: BrickReader, lower: Bricks, upper: Bricks) -> Bricks:
+def _free_without_voxels(m: VoxelMap, reader: BrickReader, lower: Bricks, upper: Bricks) -> Bricks:
     """Seen-free bricks from ``lower`` to ``upper``, both included."""
     across = upper[1:] - lower[1:] + 1
     layers = max(1, _POINTS_AT_ONCE // int(np.prod(across, dtype=np.int64)))
@@ -171,7 +135,7 @@ def _free_without_voxels(m: QueriedMap, reader: BrickReader, lower: Bricks, uppe
     return np.concatenate(found)
 
 
-def _log_odds_at(m: QueriedMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _log_odds_at(m: VoxelMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Log-odds of a map at points (N, 3) without voxels, which votes of rays say nothing of: (N,)."""
     p = np.maximum(m.occupancy(points_m).astype(np.float64), _LEAST_PROBABILITY)
     return np.asarray(np.log(p / (1 - p)))

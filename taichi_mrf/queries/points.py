@@ -26,7 +26,7 @@ OCCUPIED = 2
 def point_log_odds(
     points: ArrayLike, voxel_size: float, topology: Topology, pool: BrickPool, seen_free: float
 ) -> Any:
-    """(N, 3) points in metres -> (N,) log-odds of being occupied, float32, in the points' memory.
+    """Step 7, eq. 8: the belief at (N, 3) points in metres, (N,) log-odds, float32, in the points' memory.
 
     Where no brick exists it is the prior where no ray has passed, else ``seen_free``. Points of float32 and
     float64 are read where they are. A point that is not finite raises ConfigError.

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
-from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
+from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out
 from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
@@ -24,7 +25,7 @@ from taichi_mrf.export.ply import photo_at, write_voxels
 from taichi_mrf.export.trajectory import CAMERA_AXES, LIDAR_AXES, write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import window_of
-from taichi_mrf.methods.chunked_part import ChunkedViews, in_chunks
+from taichi_mrf.methods.chunked_part import in_chunks, render_chunked
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
@@ -140,7 +141,8 @@ def write_run(
         posed = reposed(posed, result.track.poses(result.map))
     found, noise = None, None
     if check and posed is not None:
-        found = _check(result, posed, haste, advance, None if chunked is None else ChunkedViews(chunked))
+        render = None if chunked is None else partial(render_chunked, chunked)
+        found = _check(result, posed, haste, advance, render)
         if found is not None and chunked is None:
             advance("Noise", 0, 1)
             default = is_default_noise(posed, facts.config.sensor)
@@ -226,7 +228,7 @@ def _write_map(
 
 
 def _check(
-    result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance, rendered_by: RenderedMap | None
+    result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance, render: Render | None
 ) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
     if not result.held_out or haste.hurried:
@@ -239,7 +241,7 @@ def _check(
 
     try:
         with result.timed("checking"):
-            check = check_held_out(result.map, dataset, result.held_out, checked, rendered_by)
+            check = check_held_out(result.map, dataset, result.held_out, checked, render)
     except CutShortError:
         return None
     result.skipped.update(check.skipped)

@@ -20,11 +20,11 @@ from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
+from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap, PosedDepth
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.session.pictures import thumbnail
-from taichi_mrf.session.ray_answers import PosedDepthImage
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer import messages
@@ -314,18 +314,20 @@ class Mapper:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
 
-    def posed_image(self, entry: LiveKeyframe) -> PosedDepthImage:
-        """A keyframe's depth image with its pose, for the rays of its pixels. Raises KeyframeError for a
-        frozen one."""
+    def posed_image(self, entry: LiveKeyframe) -> StoredKeyframe:
+        """A keyframe by the viewer's number, for the rays of its pixels. Raises KeyframeError for a frozen
+        one."""
         depth_m = self.depth_of(entry)
         if depth_m is None:
             raise KeyframeError(
                 f"keyframe {entry.id} ({entry.name}) is frozen: its depth image is no longer in memory"
             )
         own = self._keyframe(entry).own if entry.state == "on" else entry.own
-        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m, entry.id, own)
+        return StoredKeyframe(
+            entry.id, entry.name, depth_m, entry.T_world_camera, entry.camera, entry.stamp_s, None, own
+        )
 
-    def posed_images_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
+    def posed_images_near(self, point: NDArray[np.float64]) -> Iterator[StoredKeyframe]:
         """All keyframes that are on, the nearest to a point first."""
         entries = self.roster.with_state("on")
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))

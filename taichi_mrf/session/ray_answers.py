@@ -8,35 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.geometry.poses import inverse
+from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.origins import starts_at
-from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import RayAnswer
 
 BEHIND_SIGMAS = 3.0
 """A keyframe sees a point that lies at most this many sigma, or two voxels, behind its measurement."""
-
-
-@dataclass(frozen=True)
-class PosedDepthImage:
-    """A depth image that may have seen a point; ``depth_m`` (H, W) in metres, 0 for no measurement."""
-
-    name: str
-    T_world_camera: Pose
-    camera: Camera
-    depth_m: NDArray[np.float32]
-    keyframe: int | None = None
-    """The viewer's number of the keyframe, if it is one."""
-
-    own: OwnEvidence = NOTHING
-    """Evidence that the keyframe states of its measurements."""
-
-    def noise_model(self, default: NoiseModel) -> NoiseModel:
-        """The image's noise, if its map has the noise ``default``."""
-        return self.own.noise_model(default, self.depth_m)
 
 
 @dataclass(frozen=True)
@@ -48,7 +28,7 @@ class PixelNoise:
     sigma_m: float
 
 
-def pixel_answer(m: OccupancyMap, image: PosedDepthImage, u: float, v: float) -> RayAnswer:
+def pixel_answer(m: OccupancyMap, image: StoredKeyframe, u: float, v: float) -> RayAnswer:
     """The ray of a pixel. Raises KeyframeError if the image has no such pixel."""
     along = image.camera.directions(u, v)
     if not _in_image(image.camera, u, v):
@@ -60,8 +40,8 @@ def point_answer(
     m: OccupancyMap,
     point: Sequence[float],
     eye: Sequence[float],
-    wanted: PosedDepthImage | None,
-    others: Iterable[PosedDepthImage],
+    wanted: StoredKeyframe | None,
+    others: Iterable[StoredKeyframe],
 ) -> RayAnswer:
     """The ray through a point: of the wanted keyframe if the point lies in its image, else of the first
     other one that sees it, else from the eye, where nothing was measured."""
@@ -80,26 +60,26 @@ def point_answer(
     return _profiled(m, "from where you look; no keyframe sees this point", start, along, None, reach)
 
 
-def projected(image: PosedDepthImage, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
+def projected(image: StoredKeyframe, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
     """(u, v, depth) of a world point in an image, None if no pixel sees it."""
     seen = image.camera.project((inverse(image.T_world_camera) @ np.append(point, 1.0))[None, :3])[0]
     return None if np.isnan(seen).any() else (float(seen[0]), float(seen[1]), float(seen[2]))
 
 
 def _answer(
-    m: OccupancyMap, image: PosedDepthImage, u: float, v: float, along: NDArray[np.float64]
+    m: OccupancyMap, image: StoredKeyframe, u: float, v: float, along: NDArray[np.float64]
 ) -> RayAnswer:
     column, row = _nearest(image.camera, u, v)
     depth, range_per_depth = float(image.depth_m[row, column]), float(np.linalg.norm(along))
     noise = None
     if depth > 0:
-        sigma, bias = image.noise_model(m.noise).table(image.camera).at_pixel(column, row, depth)
+        sigma, bias = _noise_at(m, image, column, row, depth)
         noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
     title = f"{image.name}, pixel ({column}, {row})"
     T = image.T_world_camera
     start, turned = T[:3, :3] @ starts_at(image.camera, u, v) + T[:3, 3], T[:3, :3] @ along
     answer = _profiled(m, title, start, turned, noise)
-    return dataclasses.replace(answer, keyframe=image.keyframe, pixel=(column, row))
+    return dataclasses.replace(answer, keyframe=image.id, pixel=(column, row))
 
 
 def _profiled(
@@ -127,13 +107,13 @@ def _profiled(
     )
 
 
-def _sees(m: OccupancyMap, image: PosedDepthImage, u: float, v: float, depth_m: float) -> bool:
+def _sees(m: OccupancyMap, image: StoredKeyframe, u: float, v: float, depth_m: float) -> bool:
     """True if the measurement at a pixel leaves the view free up to a depth."""
     column, row = _nearest(image.camera, u, v)
     measured = float(image.depth_m[row, column])
     if measured <= 0:
         return False
-    sigma, _ = image.noise_model(m.noise).table(image.camera).at_pixel(column, row, measured)
+    sigma, _ = _noise_at(m, image, column, row, measured)
     return depth_m <= measured + max(BEHIND_SIGMAS * sigma, 2 * m.voxel_size)
 
 
@@ -144,3 +124,11 @@ def _nearest(camera: Camera, u: float, v: float) -> tuple[int, int]:
 
 def _in_image(camera: Camera, u: float, v: float) -> bool:
     return -0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5
+
+
+def _noise_at(
+    m: OccupancyMap, image: StoredKeyframe, column: int, row: int, depth_m: float
+) -> tuple[float, float]:
+    """Sigma and bias in metres of a pixel that measures a depth."""
+    model = image.own.noise_model(m.noise, image.depth_m)
+    return model.table(image.camera).at_pixel(column, row, depth_m)

@@ -19,7 +19,6 @@ from taichi_mrf.methods.capabilities import (
     window_of,
 )
 from taichi_mrf.methods.protocol import MapStatistics
-from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
@@ -149,7 +148,7 @@ class Run(SessionCore):
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,
-                has_colors=takes_colors(m) and (self.source.config.color or is_colored(m)),
+                has_colors=takes_colors(m) and (self.source.config.color or m.has_colors),
                 has_surface=measures_surface(m),
                 counts_keyframes=has_messages(m),
                 has_frames=self.source.new_replay is not None,

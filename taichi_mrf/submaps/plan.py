@@ -38,7 +38,7 @@ FREE_TO_DIFFER = ("runtime.", "volume.memory_limit_gb")
 
 
 @dataclass(frozen=True)
-class SeenKeyframe:
+class SeenFrame:
     """Part of a keyframe that the plan needs: its index in the dataset, where the camera was, in metres, and
     the chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image."""
 
@@ -104,7 +104,7 @@ def chunks_for(submap_size: float, voxel_size: float) -> int:
     return max(1, math.ceil(submap_size / (voxel_size * CHUNK_VOXELS) - 1e-9))
 
 
-def plan_submaps(keyframes: Sequence[SeenKeyframe], submap_size: float, voxel_size: float) -> Plan:
+def plan_submaps(keyframes: Sequence[SeenFrame], submap_size: float, voxel_size: float) -> Plan:
     """Cut the space that keyframes see into columns of ``submap_size`` metres, or the next whole number of
     chunks. Raises ConfigError for an impossible size."""
     chunks_across = chunks_for(submap_size, voxel_size)

@@ -13,7 +13,7 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Z_UP, Up, up_of
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
 from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import SeenKeyframe, SourceFrames
+from taichi_mrf.submaps.plan import SeenFrame, SourceFrames
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import CHUNK
 
@@ -83,7 +83,7 @@ def find_keyframes(
     runner: TaskRunner,
     skip_bad_frames: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[list[SeenKeyframe], dict[str, str]]:
+) -> tuple[list[SeenFrame], dict[str, str]]:
     """The keyframes that ``map_sequence`` would choose, with the chunks that they see, and what is wrong with
     the frames that were skipped, by name.
 
@@ -112,7 +112,7 @@ def find_keyframes(
 
 def _chosen(
     frames: Iterable[SurveyedFrame], config: Config, skip_bad_frames: bool
-) -> tuple[list[SeenKeyframe], dict[str, str]]:
+) -> tuple[list[SeenFrame], dict[str, str]]:
     selector = KeyframeSelector(config.keyframes)
     keyframes, skipped = [], {}
     for frame in frames:
@@ -125,5 +125,5 @@ def _chosen(
             if len(frame.chunks):  # else no ray is cast for it
                 T = frame.T_world_camera
                 x, y, z = T[:3, 3].tolist()
-                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks, frame.up))
+                keyframes.append(SeenFrame(frame.index, (x, y, z), frame.chunks, frame.up))
     return keyframes, skipped

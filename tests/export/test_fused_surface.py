@@ -133,7 +133,7 @@ def test_no_surface_where_the_marginals_say_free() -> None:
     m = _map_of_plane(0.0)
     found = m.surface()
     stray = dataclasses.replace(found, vertices_m=found.vertices_m - [0, 0, 0.9])
-    left = without_free(m, stray, 0.05)
+    left = without_free(stray, VOXEL, m.occupancy, 0.05)
     assert np.abs(left.vertices_m[:, :2]).max(axis=1).min() > 0.1  # beside the images all is unknown
     assert np.abs(stray.vertices_m[:, :2]).max(axis=1).min() < 0.1
-    assert len(without_free(m, found, 0.05).triangles) == len(found.triangles)
+    assert len(without_free(found, VOXEL, m.occupancy, 0.05).triangles) == len(found.triangles)

@@ -14,7 +14,7 @@ from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_part import ChunkedViews, take_part
+from taichi_mrf.methods.chunked_part import render_chunked, take_part
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
@@ -37,7 +37,7 @@ def test_the_folder_answers_queries_and_is_exported(tmp_path: Path) -> None:
     T_world_camera = np.eye(4)
     for place_m in (0.1, 3.3, 50.0):
         T_world_camera[0, 3] = place_m
-        rendered = ChunkedViews(whole).render_depth(CAMERA, T_world_camera)
+        rendered = render_chunked(whole, CAMERA, T_world_camera)
         np.testing.assert_array_equal(rendered, other.render_depth(CAMERA, T_world_camera))
     # While the run went on, what had left the window could be read as well.
     assert m.window is not None

@@ -30,7 +30,7 @@ from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import Job, SeenKeyframe, SourceFrames, chunks_for, plan_submaps
+from taichi_mrf.submaps.plan import Job, SeenFrame, SourceFrames, chunks_for, plan_submaps
 from taichi_mrf.submaps.round_files import read_core, read_report, round_path
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.submaps.task import share_moved
@@ -54,8 +54,8 @@ chunk = st.tuples(*[st.integers(-9, 9)] * 3)
 seen = st.lists(st.sets(chunk, min_size=1, max_size=6), min_size=1, max_size=8)
 
 
-def planned(views: list[set[tuple[int, int, int]]]) -> list[SeenKeyframe]:
-    return [SeenKeyframe(3 * i, (0.0, 0.0, 0.0), np.array(sorted(v), np.int32)) for i, v in enumerate(views)]
+def planned(views: list[set[tuple[int, int, int]]]) -> list[SeenFrame]:
+    return [SeenFrame(3 * i, (0.0, 0.0, 0.0), np.array(sorted(v), np.int32)) for i, v in enumerate(views)]
 
 
 @given(seen, st.integers(1, 4))

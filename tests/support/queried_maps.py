@@ -36,6 +36,8 @@ class HandMap:
     voxel_size: float = VOXEL
     keyframes: dict[int, Any] = field(default_factory=dict)
     config: Config = field(default_factory=Config)
+    has_colors: bool = False
+    has_surface: bool = False
 
     @property
     def up(self) -> Up | None:

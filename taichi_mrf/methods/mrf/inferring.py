@@ -7,18 +7,26 @@ messages behind them. Between checkpoint and return no keyframe may be added, re
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.inference.schedule import InferSteps, content_key, driven, sweep_steps
 from taichi_mrf.inference.sweep import unknown_entry_depths
 from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import PoolSnapshot
+
+if TYPE_CHECKING:
+    from taichi_mrf.methods.mrf import surfacing
+else:
+    (surfacing,) = later("taichi_mrf.methods.mrf", "surfacing")
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,22 @@ def restore_messages(parts: MapParts) -> None:
     """Compute the messages of a loaded map: its file holds none, because they follow from the images."""
     if parts.messages_lost:
         driven(infer_steps(parts), None)
+
+
+def freeze_keyframe(parts: MapParts, id: int) -> None:
+    """MRFMap.freeze_keyframe."""
+    keyframe = parts.find(id)
+    restore_messages(parts)
+    if keyframe.messages is None:
+        raise KeyframeError(f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first")
+    parts.colors.freeze(keyframe)
+    surfacing.keep_rays(parts, keyframe)
+    parts.allocator.freeze(keyframe)
+    parts.surfels.freeze(keyframe)
+    parts.decisions.frozen(id)
+    parts.frozen[id] = keyframe.name
+    del parts.keyframes[id]
+    parts.settled = False
 
 
 def show(parts: MapParts, slots: NDArray[np.int32], log_odds: NDArray[np.float32]) -> None:

@@ -45,6 +45,7 @@ class KeyframeAllocator:
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose, stamp_s: float) -> Keyframe:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
         CapacityError if there is not enough memory."""
+        # A ray stands for each block of pixels that say the same: one factor psi_r each, eq. 4.
         rays, no_returns = self.bundler.rays_of(image), no_return_rays(image, self.sensor, self.bundler)
         return self._placed(id, name, image, rays, T_world_camera, stamp_s, no_returns)
 
@@ -61,6 +62,7 @@ class KeyframeAllocator:
         no_returns: NoReturnRays | None,
     ) -> Keyframe:  # fmt: skip
         """Find the footprint of rays and claim it, if there is enough memory."""
+        # The voxels o_1 .. o_N of each ray lie in the bricks that it crosses up to 3 sigma behind d_r.
         parts = (self.registry.voxel_size, self.sensor, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
         of_no_returns = 0 if no_returns is None else no_returns.nbytes
@@ -111,8 +113,7 @@ class KeyframeAllocator:
         self.budget.mark_unallocated(keyframe.id)
 
     def freeze(self, keyframe: Keyframe) -> None:
-        """Add a keyframe's messages to the evidence that inference starts from, and keep its bricks for
-        good."""
+        """Add a keyframe's messages to the evidence that inference starts from. Its bricks stay."""
         pool, messages = self.registry.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
             leave.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())

@@ -17,7 +17,6 @@ from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
-from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
@@ -114,8 +113,7 @@ class MRFMap(BrickMap):
 
     @property
     def settled(self) -> bool:
-        """True if the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
-        stopped, and no keyframe changed since."""
+        """True after a complete :meth:`infer` with the configured sweeps, until a keyframe changes."""
         return self._parts.settled
 
     @property
@@ -158,7 +156,9 @@ class MRFMap(BrickMap):
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
         given = (color, noise, sigma_m, no_return, pose_covariance)
+        # Step 1, intake: axial depth d_r of each pixel, checked and with its noise on the device.
         image = self._parts.image(self.noise, depth_m, camera, *given)
+        # Step 2, rays: which are cast and which bricks they cross (section IV-B). Steps 3 to 6 are infer's.
         keyframe = self._parts.allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
@@ -169,8 +169,7 @@ class MRFMap(BrickMap):
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove a keyframe, its messages, and every brick that no other keyframe owns. Raises
-        KeyframeError."""
+        """Remove a keyframe, its messages, and each brick that no other owns. Raises KeyframeError."""
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
@@ -258,20 +257,7 @@ class MRFMap(BrickMap):
         A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. Of bricks that
         are not allocated yet, only that it saw them to be free is kept.
         """
-        parts, keyframe = self._parts, self._parts.find(id)
-        inferring.restore_messages(parts)
-        if keyframe.messages is None:
-            raise KeyframeError(
-                f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
-            )
-        parts.colors.freeze(keyframe)
-        surfacing.keep_rays(parts, keyframe)
-        parts.allocator.freeze(keyframe)
-        parts.surfels.freeze(keyframe)
-        parts.decisions.frozen(id)
-        parts.frozen[id] = keyframe.name
-        del self._keyframes[id]
-        parts.settled = False
+        inferring.freeze_keyframe(self._parts, id)
 
     def infer(
         self,

@@ -13,22 +13,24 @@ keyframes in the window reach further than the window, hence what is in memory d
 """
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import StorableMap, header_of
+from taichi_mrf.export.chunk_blocks import header_of
 from taichi_mrf.export.store_header import StoreHeader
+from taichi_mrf.inference.schedule import driven
 from taichi_mrf.methods.brick_registry import Bricks
+from taichi_mrf.methods.mrf.inferring import freeze_keyframe, infer_steps
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.surfacing import measured_bricks, surface_field
 from taichi_mrf.queries.known_bricks import bricks_between
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layers import (
@@ -54,14 +56,6 @@ _AT_ONCE = 32
 """Chunks whose voxels are assembled at once, a MB each."""
 
 _NONE = np.zeros(0, np.int64)
-
-
-class WindowedMap(StorableMap, Protocol):
-    """Interface of a map, as its window needs it."""
-
-    def infer(self, *, keyframes: Iterable[int] | None) -> object: ...
-
-    def freeze_keyframe(self, id: int) -> None: ...
 
 
 class MovingWindow:
@@ -91,7 +85,7 @@ class MovingWindow:
         """:meth:`park_in` the folder that goes with a map's file, in which the map is saved."""
         self.park_in(folder_beside(path))
 
-    def follow(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
+    def follow(self, m: VoxelMap, position_m: NDArray[np.float64]) -> None:
         """Move the window to a position (3,): freeze the keyframes outside of it, write and release chunks,
         and bring back those that are in it. Disk errors are warnings: the map in memory is whole."""
         keyframes = self._parts.keyframes
@@ -101,9 +95,11 @@ class MovingWindow:
             if np.linalg.norm(keyframe.T_world_camera[:3, 3] - position_m) > self.size_m
         ]
         if any(keyframes[id].messages is None for id in far):
-            m.infer(keyframes=list(keyframes))  # what is frozen cannot be swept again
+            driven(
+                infer_steps(self._parts, keyframes=list(keyframes))
+            )  # what is frozen cannot be swept again
         for id in far:
-            m.freeze_keyframe(id)
+            freeze_keyframe(self._parts, id)
         moved = self._position_m is None or np.linalg.norm(position_m - self._position_m) > STEP * self.size_m
         if moved or far:
             self._position_m = position_m.copy()
@@ -114,7 +110,7 @@ class MovingWindow:
         except (MapFileError, CapacityError) as error:
             warnings.warn(f"a chunk near the camera stays on disk: {error}", stacklevel=2)
 
-    def save_beside(self, path: Path, m: StorableMap) -> list[str]:
+    def save_beside(self, path: Path, m: VoxelMap) -> list[str]:
         """Make the folder beside a map's file hold the whole map; returns the names of the files of the
         chunks that are not in memory. Raises MapFileError."""
         header, parts = header_of(m), self._parts
@@ -166,7 +162,7 @@ class MovingWindow:
         self._parts.colors.restore(found.colors)
         self._parts.kept.restore(found.rays)
 
-    def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
+    def _leave(self, m: VoxelMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
         memory."""
         chunks = self._chunks_in_memory()

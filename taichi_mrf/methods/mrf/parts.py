@@ -147,8 +147,7 @@ class MapParts:
 
     @property
     def found_bytes(self) -> int:
-        """Bytes of the colours, of what frozen keyframes measured, and of the states and the surface that
-        were asked for."""
+        """Bytes of colours, of what frozen keyframes measured, of states and surfaces once asked for."""
         log_odds = (self.decided.value, self.calibrated.value)
         asked = sum(4 * int(each.shape[0]) for each in log_odds if each is not None)
         surfaces = (self.measured.value, self.rendered.value)

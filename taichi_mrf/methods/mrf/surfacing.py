@@ -15,10 +15,11 @@ from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.surface_votes import count_votes
 from taichi_mrf.methods.mrf.kept_rays import STEPS, RayShare
 from taichi_mrf.methods.mrf.parts import MapParts
-from taichi_mrf.queries.colored import blended_colors, is_colored
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
+from taichi_mrf.queries.colored import blended_colors
+from taichi_mrf.queries.known_bricks import BrickReader, sorted_bricks
 from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.points import probability
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -64,29 +65,29 @@ def surface_field_of(
 
 
 def surface(
-    m: QueriedMap, field: DistanceField, least: float, between: Callable[[], object] = lambda: None
+    m: VoxelMap, field: DistanceField, least: float, between: Callable[[], object] = lambda: None
 ) -> FusedSurface:
     """The surface of a field, coloured if the map is, but for where no voxel of the map has the probability
     ``least``."""
-    found = without_free(m, fused_surface(field, m.voxel_size, between), least)
-    return replace(found, colors=blended_colors(m, found.vertices_m) if is_colored(m) else None)
+    found = without_free(fused_surface(field, m.voxel_size, between), m.voxel_size, m.occupancy, least)
+    return replace(found, colors=blended_colors(m, found.vertices_m) if m.has_colors else None)
 
 
-def map_surface(m: QueriedMap, parts: MapParts, between: Callable[[], object] = lambda: None) -> FusedSurface:
+def map_surface(m: VoxelMap, parts: MapParts, between: Callable[[], object] = lambda: None) -> FusedSurface:
     """MRFMap.surface."""
     if not parts.keyframes and not parts.has_surface:
         raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
     return surface(m, surface_field(parts, between), LEAST * parts.prior, between)
 
 
-def rendered(m: QueriedMap, parts: MapParts) -> MeasuredDepth | None:
+def rendered(m: VoxelMap, parts: MapParts) -> MeasuredDepth | None:
     """The surface of a map as rays meet it; None if it has none."""
     if not parts.has_surface:
         return None
     return parts.rendered.of(parts, lambda: measured_depth_of(m, surface_field(parts), FREE * parts.prior))
 
 
-def measured_depth_of(m: QueriedMap, field: DistanceField, least: float) -> MeasuredDepth:
+def measured_depth_of(m: VoxelMap, field: DistanceField, least: float) -> MeasuredDepth:
     """The surface of a field as rays meet it. A map, or a reading of it, takes voxels for free whose
     probability is below ``least``."""
     free = probability(BrickReader(m).log_odds(field.bricks)) < least
