@@ -17,9 +17,11 @@ from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
+from taichi_mrf.methods.protocol import OccupancyMap
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class PoseRefiner:
         """Note the recorded pose of a keyframe that is placed already."""
         self._recorded[keyframe] = T_recorded
 
-    def repeat(self, keyframes: Iterable[MappedKeyframe]) -> None:
+    def repeat(self, keyframes: Iterable[Keyframe | StoredKeyframe]) -> None:
         """Add keyframes at the poses to which an earlier run has refined them, and sweep each once, as that
         run did: the map that later keyframes are aligned with is the same, bit for bit."""
         for k in keyframes:

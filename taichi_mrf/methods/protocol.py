@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,10 @@ from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.voxels.layout import CHUNK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+
+if TYPE_CHECKING:
+    from taichi_mrf.inference.keyframe import Keyframe
+    from taichi_mrf.methods.map_file import StoredKeyframe
 
 
 @dataclass(frozen=True)
@@ -74,25 +78,6 @@ class PosedDepth(Protocol):
         ...
 
 
-class MappedKeyframe(PosedDepth, Protocol):
-    """A keyframe as a map stores it."""
-
-    @property
-    def rays(self) -> int:
-        """Number of pixels that hold a measurement."""
-        ...
-
-    @property
-    def stamp_s(self) -> float:
-        """When it was taken, in seconds."""
-        ...
-
-    @property
-    def color(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) RGB, 0 0 0 where a pixel has no colour; None without a colour image."""
-        ...
-
-
 class OccupancyMap(VoxelMap, Protocol):
     """A probabilistic occupancy map of depth keyframes, whatever its method.
 
@@ -103,7 +88,7 @@ class OccupancyMap(VoxelMap, Protocol):
     """The method's entry, which says what else the map can do (capabilities.py)."""
 
     @property
-    def keyframes(self) -> Mapping[int, MappedKeyframe]: ...
+    def keyframes(self) -> "Mapping[int, Keyframe | StoredKeyframe]": ...
 
     @property
     def stale(self) -> bool:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
@@ -21,7 +22,7 @@ from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.map_file import StoredKeyframe
-from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap, PosedDepth
+from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.session.pictures import thumbnail
@@ -361,7 +362,7 @@ class Mapper:
         assert entry.map_id is not None, f"{entry.name} is {entry.state}"
         return entry.map_id
 
-    def _keyframe(self, entry: LiveKeyframe) -> MappedKeyframe:
+    def _keyframe(self, entry: LiveKeyframe) -> Keyframe | StoredKeyframe:
         return self.map.keyframes[self._map_id(entry)]
 
     def _message(

@@ -25,7 +25,7 @@ from taichi_mrf.methods.mrf.surfacing import (
     surface_field,
     surface_field_of,
 )
-from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.view import View
 from taichi_mrf.system import tensors
@@ -71,7 +71,7 @@ class MapReading(BrickMap):
         self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)
 
     @property
-    def keyframes(self) -> Mapping[int, MappedKeyframe]:
+    def keyframes(self) -> Mapping[int, Keyframe]:
         """The keyframes of the map that is read."""
         return MappingProxyType(self._parts.keyframes)
 
