@@ -52,16 +52,22 @@ $(VENV)/.created:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
+# Modules are compiled when they are first imported, not when they are installed: most never are.
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+
 $(VENV)/.installed: $(VENV)/.created pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	$(PIP) -e .
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[octomap]" 2>/dev/null \
-		|| echo "OctoMap (extra: octomap) has no wheel for this Python: its comparison is left out."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[quadrants]" 2>/dev/null \
-		|| echo "Quadrants (extra: quadrants) has no wheel for this Python: tests of the second compiler are left out."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps "ouster-sdk>=1.0" 2>/dev/null \
+# At once if this Python has wheels for all of it, else extra by extra.
+$(VENV)/.installed-dev: $(VENV)/.created pyproject.toml
+	$(PIP) -e ".[dev,octomap,quadrants]" 2>/dev/null || { \
+		$(PIP) -e ".[dev]" || exit 1; \
+		$(PIP) -e ".[octomap]" 2>/dev/null \
+			|| echo "OctoMap (extra: octomap) has no wheel for this Python: its comparison is left out."; \
+		$(PIP) -e ".[quadrants]" 2>/dev/null \
+			|| echo "Quadrants (extra: quadrants) has no wheel for this Python: tests of the second compiler are left out."; \
+	}
+	@$(PIP) --no-deps "ouster-sdk>=1.0" 2>/dev/null \
 		|| echo "ouster-sdk (extra: ouster) has no wheel for this Python: tests of real recordings are left out."
-	@touch $@
+	@touch $(VENV)/.installed $@
