@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.conventions import AS_USUAL, Conventions
+from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.derived import Chosen, Derived, chosen
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -38,6 +38,8 @@ def pose_of(T_recorded: Pose, conventions: Conventions) -> Pose:
     if conventions.w_first:
         w, x, y, z = quaternion(T[:3, :3])
         T = pose_from_quaternion(np.array([*T[:3, 3], x, y, z, w]))
+    if conventions.unit:
+        T[:3, 3] /= POSE_UNITS[conventions.unit]
     if conventions.inverse:
         T = inverse(T)
     if conventions.axes:  # a product with the identity would lose the sign of zeros, which orders keyframes
