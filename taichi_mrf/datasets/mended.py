@@ -65,6 +65,12 @@ def origin_of(position_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.rint(position_m / ORIGIN_STEP_M) * ORIGIN_STEP_M if far else np.zeros(3)
 
 
+def stated_origin(dataset: Dataset) -> tuple[float, ...] | None:
+    """The origin as a dataset's frames state it, None if it was not moved."""
+    origin_m = dataset.origin_m
+    return tuple(origin_m.tolist()) if origin_m.any() else None
+
+
 def moved_note(origin_m: NDArray[np.float64]) -> str:
     """A note that the origin was moved."""
     return "the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*(origin_m + 0.0))
@@ -105,7 +111,8 @@ class Mended(Derived):
         depth_m = axial_depth(frame.depth_m, frame.camera, self.conventions)
         T = pose_of(frame.T_world_camera, self.conventions)
         T[:3, 3] -= self.moved_m
-        return replace(frame, depth_m=depth_m, T_world_camera=T if self.timed is None else self.pose(index))
+        T = T if self.timed is None else self.pose(index)
+        return replace(frame, depth_m=depth_m, T_world_camera=T, origin_m=stated_origin(self))
 
 
 def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | None = None) -> Dataset:
