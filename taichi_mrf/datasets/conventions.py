@@ -14,8 +14,12 @@ from taichi_mrf.errors import ConfigError
 AXES = ("opengl", "ros")
 """Axes of a camera other than the optical ones: x right, y up, z back; and x ahead, y left, z up."""
 
+POSE_UNITS = {"mm": 1000.0, "cm": 100.0}
+"""Units of positions other than metres, and how many are in a metre."""
+
 INVERSE, W_FIRST, LATE = "inverse", "wxyz", "late"
-WORDS = (INVERSE, W_FIRST, *AXES, f"{LATE}=SECONDS")
+_PLAIN = (INVERSE, W_FIRST, *AXES, *POSE_UNITS)
+WORDS = (*_PLAIN, f"{LATE}=SECONDS")
 AXIAL, RANGE = "axial", "range"
 
 
@@ -25,6 +29,9 @@ class Conventions:
 
     w_first: bool = False
     """Quaternions are w x y z, and were read as x y z w."""
+
+    unit: str = ""
+    """One of POSE_UNITS, in which positions are; empty for metres."""
 
     inverse: bool = False
     """Poses are T_camera_world."""
@@ -53,7 +60,8 @@ class Conventions:
 
     def flags(self) -> list[str]:
         """The flags that set these conventions, as they are typed."""
-        words = [W_FIRST] * self.w_first + [INVERSE] * self.inverse + [self.axes] * bool(self.axes)
+        words = [W_FIRST] * self.w_first + [INVERSE] * self.inverse
+        words += [word for word in (self.axes, self.unit) if word]
         words += [f"{LATE}={self.late_s:g}"] if self.late_s else []
         flags = [f"--poses-are {','.join(words)}"] if words else []
         flags += [f"--mounting {','.join(f'{x:g}' for x in self.mounting)}"] if self.mounting else []
@@ -67,20 +75,27 @@ AS_USUAL = Conventions()
 def conventions_of(poses_are: str | None, mounting: tuple[float, ...] | None, depth_is: str) -> Conventions:
     """The conventions of these flags. Raises ConfigError, which names the flag and the nearest word."""
     words = [word.strip().lower() for word in (poses_are or "").split(",") if word.strip()]
-    axes, late_s = "", 0.0
+    late_s = 0.0
     for word in words:
         name, equals, value = word.partition("=")
         if equals and name == LATE:
             late_s = _seconds(value)
-        elif name in AXES and not equals:
-            if axes not in ("", name):
-                raise ConfigError(f"--poses-are: {axes} and {name} are both axes; name one")
-            axes = name
-        elif word not in (INVERSE, W_FIRST):
-            near = get_close_matches(word, (INVERSE, W_FIRST, *AXES), n=1)
+        elif word not in _PLAIN:
+            near = get_close_matches(word, _PLAIN, n=1)
             meant = f"did you mean '{near[0]}'? " if near else ""
             raise ConfigError(f"--poses-are: no such word '{word}'; {meant}It takes {', '.join(WORDS)}")
-    return Conventions(W_FIRST in words, INVERSE in words, axes, mounting or (), late_s, depth_is == RANGE)
+    axes, unit = _only(words, AXES, "axes"), _only(words, tuple(POSE_UNITS), "units")
+    return Conventions(
+        W_FIRST in words, unit, INVERSE in words, axes, mounting or (), late_s, depth_is == RANGE
+    )
+
+
+def _only(words: list[str], choice: tuple[str, ...], what: str) -> str:
+    """The word that is one of a choice, empty if none is. Raises ConfigError if two are."""
+    found = list(dict.fromkeys(word for word in words if word in choice))
+    if len(found) > 1:
+        raise ConfigError(f"--poses-are: {found[0]} and {found[1]} are both {what}; name one")
+    return found[0] if found else ""
 
 
 def _seconds(text: str) -> float:

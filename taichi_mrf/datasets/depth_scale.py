@@ -116,7 +116,8 @@ def out_of_sight(dataset: Dataset) -> str:
         return ""
     return (
         f"the sensor moves {step_m:.3g} m from frame to frame, farther than it sees ({max(far_m):.3g} m), so "
-        "that frames do not overlap: its poses may be in another unit than its depths, such as millimetres"
+        "that frames do not overlap: its poses may be in another unit than its depths, such as millimetres "
+        "(--poses-are mm)"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.conventions import AS_USUAL, Conventions
+from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.derived import Chosen, Derived, chosen
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -38,6 +38,8 @@ def pose_of(T_recorded: Pose, conventions: Conventions) -> Pose:
     if conventions.w_first:
         w, x, y, z = quaternion(T[:3, :3])
         T = pose_from_quaternion(np.array([*T[:3, 3], x, y, z, w]))
+    if conventions.unit:
+        T[:3, 3] /= POSE_UNITS[conventions.unit]
     if conventions.inverse:
         T = inverse(T)
     if conventions.axes:  # a product with the identity would lose the sign of zeros, which orders keyframes
@@ -61,6 +63,12 @@ def origin_of(position_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """The origin (3,) near a position: zero, unless that is far from it."""
     far = np.abs(position_m).max() > NEAR_ORIGIN_M
     return np.rint(position_m / ORIGIN_STEP_M) * ORIGIN_STEP_M if far else np.zeros(3)
+
+
+def stated_origin(dataset: Dataset) -> tuple[float, ...] | None:
+    """The origin as a dataset's frames state it, None if it was not moved."""
+    origin_m = dataset.origin_m
+    return tuple(origin_m.tolist()) if origin_m.any() else None
 
 
 def moved_note(origin_m: NDArray[np.float64]) -> str:
@@ -103,7 +111,8 @@ class Mended(Derived):
         depth_m = axial_depth(frame.depth_m, frame.camera, self.conventions)
         T = pose_of(frame.T_world_camera, self.conventions)
         T[:3, 3] -= self.moved_m
-        return replace(frame, depth_m=depth_m, T_world_camera=T if self.timed is None else self.pose(index))
+        T = T if self.timed is None else self.pose(index)
+        return replace(frame, depth_m=depth_m, T_world_camera=T, origin_m=stated_origin(self))
 
 
 def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | None = None) -> Dataset:

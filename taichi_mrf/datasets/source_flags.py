@@ -33,7 +33,7 @@ class SourceFlags:
 
     poses_are: str | None = None
     """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, with commas between: inverse
-    (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), late=SECONDS."""
+    (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), mm or cm (unit), late=SECONDS."""
 
     mounting: str | None = None
     """Place of the camera in the frame that the poses are of: x,y,z,qx,qy,qz,qw in metres."""

@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, RANGE, Conventions
+from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
 from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
-from taichi_mrf.doctor.readings import POSE_UNITS, UNITS, Reading
+from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
@@ -97,6 +97,7 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
     if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
         return Diagnosis((), (_NO_READING,), given)
+    best = _with_unit_of_poses(best, steps)
     found = tuple(_findings(given, best, steps, source))
     return Diagnosis(found, undecided, best, before, search.score(best), search)
 
@@ -138,20 +139,20 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
     if best.late_s != given.late_s:
         late = "late" if best.late_s >= 0 else "early"
         found.append(Finding(f"the stamps of the poses are {abs(best.late_s):.2f} s {late}", poses))
+    if best.unit != given.unit:
+        name = UNITS[POSE_UNITS[best.unit]] if best.unit else UNITS[1.0]
+        found.append(Finding(f"poses are in {name}", poses))
     if best.along_ray != given.along_ray:
         along, word = ("ray", RANGE) if best.along_ray else ("optical axis", AXIAL)
         found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
     if best.factor != given.factor:
         right = steps / best.factor
-        unit = next((name for each, name in UNITS.items() if math.isclose(each, right, rel_tol=1e-6)), "")
-        if unit == UNITS[1.0] and right != steps and best.factor not in POSE_UNITS:
+        unit = _unit_of_depth(right)
+        if unit == UNITS[1.0] and right != steps:
             text = (
                 "poses and depths are in one unit, and that is not metres: with millimetres, divide positions"
             )
             found.append(Finding(f"{text} by 1000", "--depth-scale 1000"))
-        elif best.factor in POSE_UNITS and unit in ("", UNITS[1.0]):  # no sensor counts whole metres
-            of_poses = POSE_UNITS[best.factor]
-            found.append(Finding(f"poses are in {of_poses}: divide their positions by {best.factor:g}"))
         else:
             text = f"depth has {right:.6g} steps per metre ({unit}), not {steps:.6g}"
             found.append(Finding(text, f"--depth-scale {right:.6g}"))
@@ -160,6 +161,22 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         flag = f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
         found.append(Finding(f"the intrinsics {best.lens}", flag))
     return found
+
+
+def _with_unit_of_poses(best: Reading, steps: float) -> Reading:
+    """The reading in which it is the poses that have another unit, if depth with the factor would have none
+    that sensors have (no sensor counts whole metres), or if they are in metres."""
+    factor = best.factor * POSE_UNITS.get(best.unit, 1.0)
+    unit = {1.0: "", **{factor: unit for unit, factor in POSE_UNITS.items()}}.get(round(factor, 9))
+    of_poses = unit == "" or _unit_of_depth(steps / best.factor) in ("", UNITS[1.0])
+    if best.factor == 1.0 or unit is None or not of_poses:
+        return best
+    return replace(best, factor=1.0, unit=unit)
+
+
+def _unit_of_depth(steps: float) -> str:
+    """Whose depth has so many steps per metre, empty if nobody's."""
+    return next((name for each, name in UNITS.items() if math.isclose(each, steps, rel_tol=1e-6)), "")
 
 
 def _same_poses(sample: Sample) -> bool:

@@ -18,9 +18,6 @@ UNITS = {
 }
 """Steps per metre of depth, and whose they are."""
 
-POSE_UNITS = {1000.0: "millimetres", 100.0: "centimetres"}
-"""Factors by which depths in metres are multiplied to fit poses in another unit, and its name."""
-
 
 def _resized(factor: float) -> Callable[[PinholeCamera], PinholeCamera]:
     return lambda k: replace(

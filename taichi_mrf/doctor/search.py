@@ -8,11 +8,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.conventions import AXES
+from taichi_mrf.datasets.conventions import AXES, POSE_UNITS
 from taichi_mrf.datasets.depth_scale import SeenAgain, seen_again
 from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.timed_poses import TimedPoses
-from taichi_mrf.doctor.readings import LENSES, POSE_UNITS, UNITS, Reading
+from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
 from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -58,7 +58,9 @@ class Search:
     def __init__(self, sample: Sample, given: Reading, steps_per_metre: float) -> None:
         """``steps_per_metre`` is the unit of the depth images as they are read."""
         self.sample, self.given = sample, given
-        factors = np.array([*(steps_per_metre / steps for steps in UNITS), *POSE_UNITS])
+        # Depths in another unit than poses are depths that are multiplied (Reading.with_unit_of_poses).
+        of_poses = [1 / POSE_UNITS[given.unit]] if given.unit else POSE_UNITS.values()
+        factors = np.array([*(steps_per_metre / steps for steps in UNITS), *of_poses])
         self._units = [float(each) for each in np.unique(factors.round(12)) if not np.isclose(each, 1.0)]
         self._known: dict[Reading, Floats] = {}
         self._mended: dict[Reading, Floats] = {}

@@ -66,3 +66,4 @@ def write_chunks(
             assert surface is not None
             sums = surface.box(np.array((x, y, z), np.int64) * CHUNK_VOXELS, CHUNK_VOXELS)
             store.write({SURFACE: BrickValues.of_chunk((x, y, z), np.stack(sums, axis=-1))})
+        store.fill(chunks)

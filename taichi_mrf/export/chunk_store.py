@@ -1,11 +1,12 @@
 """A map as a chunked array on disk, in zarr 3, for maps that are larger than memory.
 
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
-voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3) int32 lists
-the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1. The other
-layers that the map has (voxels/layers.py) are arrays (x, y, z, width) of their own, 0 for nothing. The
-attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer corner of the array's first
-voxel.
+voxels; unknown voxels are NaN. ``chunks`` (n, 3) int32 lists the stored chunks in the world's coordinates:
+chunk c covers the voxels 64 c to 64 (c + 1) - 1. The other layers that the map has (voxels/layers.py) are
+arrays (x, y, z, width) of their own, 0 for nothing. The attributes hold the rest: see :class:`StoreHeader`,
+``origin_m``, the outer corner of the array's first voxel, and ``every_chunk_stored``, true where each chunk
+on the list has a file of log-odds, so that a lost file is told from unknown space. zstd's checksums tell
+changed bits.
 
 A store can grow during a run, and be read at any moment. Each file is written in a folder beside the store
 and moved into place: a chunk's file first, then the list that names it. A run that is killed in between
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.export.store_header import (
     CHUNKS,
+    EVERY_CHUNK,
     FORMAT,
     FORMAT_KEY,
     StoreHeader,
@@ -76,7 +78,7 @@ class ChunkStore:
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
-        zarr = library("zarr", "maps in chunks need", "store")
+        zarr = _zarr()
         path = Path(path)
         lowest, highest = (
             (chunks.min(axis=0), chunks.max(axis=0)) if len(chunks) else (np.zeros(3), np.zeros(3))
@@ -85,23 +87,29 @@ class ChunkStore:
             lowest, highest = np.full(3, -FARTHEST), np.full(3, FARTHEST - 1)
         shape = (highest - lowest + 1).astype(int) * CHUNK_VOXELS
         origin_m = lowest * CHUNK_VOXELS * header.voxel_size
-        place = {"lowest_chunk": lowest.astype(int).tolist(), "origin_m": origin_m.tolist()}
+        place = {
+            "lowest_chunk": lowest.astype(int).tolist(),
+            "origin_m": origin_m.tolist(),
+            EVERY_CHUNK: True,
+        }
+        packed = zarr.codecs.ZstdCodec(checksum=True)
         try:
             group = zarr.create_group(
-                store=str(path), attributes={FORMAT_KEY: FORMAT, **asdict(header), **place}
+                store=str(path), attributes={FORMAT_KEY: FORMAT, **asdict(header), **place, EVERY_CHUNK: True}
             )
             for name in (LOG_ODDS, *layers):
                 layer, last = LAYERS[name], _last_axis(name)
                 group.create_array(
                     name, shape=(*shape.tolist(), *last), chunks=(*(CHUNK_VOXELS,) * 3, *last),
-                    dtype=layer.dtype, fill_value=layer.missing,
+                    dtype=layer.dtype, fill_value=layer.missing, compressors=packed,
                     dimension_names=("x", "y", "z", "value")[: 3 + len(last)],
                 )  # fmt: skip
             listed = np.ascontiguousarray(chunks, np.int32).reshape(-1, 3)
             in_one_file = (LISTED_TOGETHER if grows else max(1, len(listed)), 3)
-            group.create_array(CHUNKS, shape=listed.shape, chunks=in_one_file, dtype="int32", fill_value=0)[
-                :
-            ] = listed
+            group.create_array(
+                CHUNKS, shape=listed.shape, chunks=in_one_file,
+                dtype="int32", fill_value=0, compressors=packed,
+            )[:] = listed  # fmt: skip
         except OSError as error:
             raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
         return cls(path, group, read_layout(path))
@@ -109,7 +117,7 @@ class ChunkStore:
     @classmethod
     def open(cls, path: str | Path) -> "ChunkStore":
         """A store that exists. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
-        zarr = library("zarr", "maps in chunks need", "store")
+        zarr = _zarr()
         path = Path(path)
         if not is_folder(path):
             raise MapFileError(f"{path}: there is no such folder")
@@ -156,20 +164,24 @@ class ChunkStore:
         for name, found in layers.items():
             last = _last_axis(name)
             for chunk, block in chunk_blocks(LAYERS[name], found):
-                place = (*self._place(chunk), *(0 for _ in last))
-                try:
-                    self._group[name].blocks[place] = block.reshape(*(CHUNK_VOXELS,) * 3, *last)
-                except OSError as error:
-                    raise MapFileError(
-                        f"{self.path}: cannot be written: {error.strerror or error}"
-                    ) from error
+                self._put(name, chunk, block.reshape(*(CHUNK_VOXELS,) * 3, *last))
+
+    def fill(self, chunks: NDArray[np.int32]) -> None:
+        """Write that nothing is known in those of some chunks, (n, 3), that have not been written. Raises
+        MapFileError."""
+        for x, y, z in chunks.tolist():
+            if not exists(self.path / self.file_of(LOG_ODDS, (x, y, z))):
+                self._put(LOG_ODDS, (x, y, z), LAYERS[LOG_ODDS].missing)
 
     def read(self, name: str, chunk: Sequence[int]) -> NDArray:
         """One of :attr:`layers` of one of :attr:`chunks`, (64, 64, 64), with a last axis for one of more than
         one value. Raises MapFileError."""
         layer, last = LAYERS[name], _last_axis(name)
         size = int(np.prod(layer.chunk_shape)) * np.dtype(layer.dtype).itemsize
-        check_packed(self.path / self.file_of(name, chunk), size)
+        file = self.path / self.file_of(name, chunk)
+        if name == LOG_ODDS and self._layout.every_chunk and not exists(file):
+            raise MapFileError(f"{file}: damaged: there is no such file, which holds a part of the map")
+        check_packed(file, size)
         what = f"{name} of chunk {tuple(chunk)}"
         try:
             place = (*self._place(chunk), *(0 for _ in last))
@@ -181,9 +193,21 @@ class ChunkStore:
             raise MapFileError(f"{self.path}: damaged: {what} holds a value that is not finite")
         return found.reshape(layer.chunk_shape)
 
+    def _put(self, name: str, chunk: Chunk, values: NDArray | float) -> None:
+        """Write a layer of a chunk, log-odds also where nothing is known."""
+        try:
+            with _zarr().config.set({"array.write_empty_chunks": name == LOG_ODDS}):
+                self._group[name].blocks[(*self._place(chunk), *(0 for _ in _last_axis(name)))] = values
+        except OSError as error:
+            raise MapFileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
     def _place(self, chunk: Sequence[int]) -> Chunk:
         x, y, z = (np.array(chunk, np.int64) - self._layout.lowest_chunk).tolist()
         return x, y, z
+
+
+def _zarr() -> Any:
+    return library("zarr", "maps in chunks need", "store")
 
 
 def _last_axis(name: str) -> tuple[int, ...]:
@@ -246,6 +270,7 @@ def put_chunks(path: Path, header: StoreHeader, put: NDArray[np.int32], layers: 
         others = tuple(name for name in layers if name != LOG_ODDS)
         stage = ChunkStore.create(staging, header, chunks, grows=True, layers=others)
         stage.write(layers)
+        stage.fill(new)
         if not grown:
             os.replace(staging, path)
             return
@@ -272,7 +297,7 @@ def _listed(path: Path) -> NDArray[np.int32]:
 
 
 def _move(staging: Path, path: Path, file: Path) -> None:
-    """Move a file of the staged store to its place. zarr writes none for a chunk without known voxels."""
+    """Move a file of the staged store to its place. zarr writes none for an extra layer without values."""
     if (staging / file).exists():
         (path / file).parent.mkdir(parents=True, exist_ok=True)
         os.replace(staging / file, path / file)

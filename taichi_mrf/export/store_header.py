@@ -21,6 +21,7 @@ from taichi_mrf.voxels.layout import CHUNK_VOXELS
 FORMAT = 1
 FORMAT_KEY = "taichi_mrf_map"
 CHUNKS = "chunks"
+EVERY_CHUNK = "every_chunk_stored"
 
 _MOST_BYTES = 1_000_000
 _LARGEST_VOXEL_M = 1000.0
@@ -67,8 +68,9 @@ class StoreHeader:
 @dataclass(frozen=True)
 class StoreLayout:
     """The header, the first of the chunks that there is room for, (3,), how many there are along each axis,
-    how many of them are listed, how many together in one file of the list, and the ``layers`` beside
-    log-odds that there are."""
+    how many of them are listed, how many together in one file of the list, the ``layers`` beside log-odds
+    that there are, and if ``every_chunk`` on the list has a file of log-odds: earlier versions left out those
+    in which nothing is known."""
 
     header: StoreHeader
     lowest_chunk: tuple[int, int, int]
@@ -76,6 +78,7 @@ class StoreLayout:
     listed: int
     listed_together: int
     layers: tuple[str, ...] = ()
+    every_chunk: bool = False
 
 
 def read_layout(folder: Path) -> StoreLayout:
@@ -101,7 +104,10 @@ def read_layout(folder: Path) -> StoreLayout:
         sides = _array(folder, name, layer.dtype, 0, 4)
         if sides != ((*shape, layer.width), (*chunk_shape, layer.width)):
             raise _damaged(folder, f"{name} is not made of the chunks of {LOG_ODDS}")
-    return StoreLayout(header, lowest, across, listed, together[0], layers)
+    every_chunk = attributes.get(EVERY_CHUNK, False)
+    if not isinstance(every_chunk, bool):
+        raise _damaged(folder, f"{EVERY_CHUNK} is not true or false")
+    return StoreLayout(header, lowest, across, listed, together[0], layers, every_chunk)
 
 
 def check_packed(path: Path, size: int) -> None:

@@ -156,11 +156,25 @@ class BrickMap(Owned):
 
     def add(self: OccupancyMap, frame: Frame) -> int:
         """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. What the frame
-        states of its measurements counts as the configuration says, and its colours if the map has any.
-        Raises what ``add_keyframe`` raises."""
+        states of its measurements counts as the configuration says, and its colours if the map has any. The
+        first frame also says where the map's origin lies in the recorded world, if it was moved. Raises what
+        ``add_keyframe`` raises, and ConfigError for a frame of another origin."""
+        assert isinstance(self, BrickMap)
+        self._take_origin(frame)
         color = frame.color if self.METHOD.has_colors else None
         parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
         return self.add_keyframe(frame.depth_m, *parts, **frame.own_in(self.config).arguments())
+
+    def _take_origin(self, frame: Frame) -> None:
+        origin = self.config.volume.origin
+        if frame.origin_m is None or frame.origin_m == origin:
+            return
+        if self._next_id or any(origin):
+            theirs, own = (" ".join(f"{x:.0f}" for x in place) for place in (frame.origin_m, origin))
+            raise ConfigError(f"frame {frame.name}: its world's origin is {theirs}, the map's is {own}")
+        x, y, z = frame.origin_m
+        volume = dataclasses.replace(self.config.volume, origin=(x, y, z))
+        self.config = dataclasses.replace(self.config, volume=volume)
 
     def _stamp(self, stamp_s: Any) -> float:
         """A new keyframe's stamp; the number of keyframes added before if it is None."""

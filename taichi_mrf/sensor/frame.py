@@ -30,7 +30,8 @@ class Frame:
 
     The other fields are None where the sensor's configuration answers for all frames: ``sigma_m``, (H, W)
     float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
-    ``no_return``, (H, W) bool, the pixels that looked and got nothing back. ``sensor`` names the sensor of a
+    ``no_return``, (H, W) bool, the pixels that looked and got nothing back; ``origin_m``, where the world's
+    origin lies in the recorded world if it was moved (Dataset.origin_m). ``sensor`` names the sensor of a
     recording of several. ``gyro`` has the camera's angular rates up to this frame and for at least the time
     since the one before, ``acceleration`` its accelerations for the time since the two before.
     """
@@ -47,6 +48,7 @@ class Frame:
     sensor: str = ""
     gyro: "GyroSamples | None" = None
     acceleration: "AccelerationSamples | None" = None
+    origin_m: tuple[float, ...] | None = None
 
     @property
     def points_m(self) -> NDArray[np.float64]:

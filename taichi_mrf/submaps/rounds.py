@@ -250,3 +250,4 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
             empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
             bricks, belief = np.concatenate([bricks, free]), np.concatenate([belief, empty])
             store.write({LOG_ODDS: BrickValues(bricks, known_log_odds(belief, header.prior_log_odds))})
+        store.fill(store.chunks)

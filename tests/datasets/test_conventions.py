@@ -27,6 +27,10 @@ def on_mounting(T: Pose) -> Pose:
     return T @ inverse(pose_from_quaternion(np.array(MOUNTING)))
 
 
+def in_steps(T: Pose, per_metre: float) -> Pose:
+    return moved(T, (per_metre - 1) * T[:3, 3])
+
+
 WRITTEN: dict[str, tuple[Callable[[Pose], Pose], dict]] = {
     "inverse": (inverse, {"poses_are": "inverse"}),
     "opengl": (opengl, {"poses_are": "opengl"}),
@@ -34,6 +38,8 @@ WRITTEN: dict[str, tuple[Callable[[Pose], Pose], dict]] = {
     "w first": (w_first, {"poses_are": "wxyz"}),
     "inverse, opengl": (lambda T: inverse(opengl(T)), {"poses_are": "opengl,inverse"}),
     "w first, inverse": (lambda T: w_first(inverse(T)), {"poses_are": "wxyz,inverse"}),
+    "millimetres": (lambda T: in_steps(T, 1000), {"poses_are": "mm"}),
+    "inverse, centimetres": (lambda T: in_steps(inverse(T), 100), {"poses_are": "cm,inverse"}),
     "mounting": (on_mounting, {"mounting": MOUNTING}),
 }
 
@@ -115,6 +121,7 @@ def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:
     [
         ({"poses_are": "invers"}, "no such word 'invers'; did you mean 'inverse'"),
         ({"poses_are": "opengl,ros"}, "opengl and ros are both axes"),
+        ({"poses_are": "mm,cm"}, "mm and cm are both units"),
         ({"poses_are": "late=soon"}, "a number of seconds, not 'soon'"),
         ({"mounting": "1,2,3"}, "--mounting takes x,y,z,qx,qy,qz,qw, not '1,2,3'"),
         ({"mounting": "1,2,3,0,0,0,0"}, "its quaternion is zero"),

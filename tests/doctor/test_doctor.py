@@ -16,6 +16,7 @@ from stereo_rig import write_kitti
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
@@ -140,7 +141,11 @@ def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
     assert "all the same" in finding.text
     assert "--poses FILE" in finding.text
     (finding,) = diagnose(of_frames(in_millimetres(room))).findings
-    assert finding.text == "poses are in millimetres: divide their positions by 1000"
+    assert (finding.text, finding.flag) == ("poses are in millimetres", "--poses-are mm")
+    (finding,) = diagnose(of_frames(broken(in_millimetres(room), "opengl"))).findings[1:]
+    assert (finding.text, finding.flag) == ("poses are in millimetres", "--poses-are opengl,mm")
+    (finding,) = diagnose(of_frames(room), Conventions(unit="mm")).findings
+    assert (finding.text, finding.flag) == ("poses are in metres", "--poses-are ''")
     both = [replace(f, depth_m=np.rint(1000 * f.depth_m) / np.float32(5000)) for f in in_millimetres(room)]
     (finding,) = diagnose(of_frames(both)).findings
     assert finding.text.startswith("poses and depths are in one unit, and that is not metres")

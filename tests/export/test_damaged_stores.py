@@ -121,6 +121,40 @@ def test_what_is_wrong_is_named(store: Path, change: Callable[[dict[str, Any]], 
         everything(store)
 
 
+def test_a_lost_chunk_is_named_and_is_unknown_in_stores_of_earlier_versions(store: Path) -> None:
+    (store / "log_odds/c/0/1/0").unlink()
+    with pytest.raises(MapFileError, match=r"log_odds/c/0/1/0: damaged: there is no such file"):
+        everything(store)
+    document = json.loads((store / "zarr.json").read_text())
+    del document["attributes"]["every_chunk_stored"]
+    (store / "zarr.json").write_text(json.dumps(document))
+    assert np.isfinite(ChunkStore.open(store).read(LOG_ODDS, CHUNK)).all()
+    assert np.isnan(ChunkStore.open(store).read(LOG_ODDS, (0, 1, 0))).all()
+
+
+@pytest.mark.parametrize(("file", "said"), [("log_odds/c/0/0/0", "log_odds of chunk"), ("chunks/c/0/0", "")])
+def test_a_changed_bit_is_told_or_changes_nothing(store: Path, file: str, said: str) -> None:
+    def contents() -> list[np.ndarray]:
+        again = ChunkStore.open(store)
+        return [again.chunks, *(again.read(LOG_ODDS, chunk) for chunk in again.chunks)]
+
+    whole, expected, told = (store / file).read_bytes(), contents(), []
+    bits = {*range(8 * 18), *np.random.default_rng(0).integers(0, 8 * len(whole), 100).tolist()}
+    for bit in (bit for bit in bits if bit < 8 * len(whole)):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        (store / file).write_bytes(changed)
+        try:
+            found = contents()
+        except MapFileError as error:
+            told.append(str(error))
+        else:  # a bit of the header that has no meaning
+            for one, other in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(one, other)
+    assert all(said in text or file in text for text in told)
+    assert len(told) > min(len(bits), 8 * len(whole)) // 2
+
+
 @pytest.mark.skipif(os.name == "nt", reason="FIFOs are a POSIX feature")
 @pytest.mark.parametrize(
     "file", ["zarr.json", "log_odds/zarr.json", "chunks/zarr.json", "log_odds/c/0/0/0", "chunks/c/0/0"]

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from datasets_recordings import Content, write_tum
 from small_room import add, frames
 
 from taichi_mrf.config.schema import Config, VolumeConfig
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError
@@ -79,6 +81,27 @@ def test_a_map_file_keeps_it_and_maps_of_two_origins_are_not_compared(far: MRFMa
     compare_maps(far, loaded)
     with pytest.raises(ConfigError, match=r"origins .* 412000 5412000 0 and 0 0 0"):
         compare_maps(far, mapped((0.0, 0.0, 0.0)))
+
+
+def test_the_first_frame_of_a_recording_sets_it_and_others_must_have_the_same(tmp_path: Path) -> None:
+    content = Content()
+    near = [T.copy() for T in content.poses]
+    for T in content.poses:
+        T[:3, 3] += ORIGIN
+    dataset = open_dataset(write_tum(tmp_path / "far", content))
+    m = MRFMap(voxel_size=0.1)
+    m.add(dataset.read(0))
+    assert m.config.volume.origin == tuple(dataset.origin_m) == ORIGIN
+    m.add(dataset.read(1))
+    m.infer()
+    m.save(tmp_path / "map.npz")
+    assert load_map(tmp_path / "map.npz").config.volume.origin == ORIGIN
+    assert m.decided.config.volume.origin == ORIGIN
+    content.poses = near
+    other = MRFMap(voxel_size=0.1)
+    other.add(open_dataset(write_tum(tmp_path / "near", content)).read(0))
+    with pytest.raises(ConfigError, match="its world's origin is 412000 5412000 0, the map's is 0 0 0"):
+        other.add(dataset.read(0))
 
 
 def test_the_recording_sets_it_and_a_box_moves_with_it() -> None:

@@ -84,6 +84,21 @@ def test_an_interrupted_write_leaves_the_old_chunk_or_the_new_one(
     assert [p.name for p in tmp_path.iterdir()] == ["map.zarr"]
 
 
+def test_a_chunk_that_is_lost_is_told_from_one_of_which_nothing_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "map.zarr"
+    put(path, {A: 1, B: 2})
+    put_chunks(path, HEADER, np.array([A, C], np.int32), layers_of(LOG_ODDS, {}))
+    store = ChunkStore.open(path)
+    assert np.isnan(store.read(LOG_ODDS, A)).all()
+    assert np.isnan(store.read(LOG_ODDS, C)).all()
+    lost = path / store.file_of(LOG_ODDS, C)
+    lost.unlink()
+    with pytest.raises(MapFileError, match="there is no such file, which holds a part of the map") as told:
+        store.read(LOG_ODDS, C)
+    assert str(lost) in str(told.value)
+    assert np.nanmax(store.read(LOG_ODDS, B)) == 2
+
+
 def test_a_store_of_fixed_size_is_not_added_to(tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
     ChunkStore.create(path, HEADER, np.array([A], np.int32))

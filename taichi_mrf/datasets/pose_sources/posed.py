@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
 from taichi_mrf.datasets.derived import Chosen
-from taichi_mrf.datasets.mended import moved_note
+from taichi_mrf.datasets.mended import moved_note, stated_origin
 from taichi_mrf.datasets.pose_sources.base import PoseSource
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
@@ -55,7 +55,10 @@ class PosedFrames(Chosen):
         frame = self.source.read(self.indices[index])
         self._recorded[self.indices[index]] = frame.T_world_camera
         T_world_camera = self.pose_now(frame.name, frame.stamp)
-        return frame if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
+        if T_world_camera is None:
+            return frame
+        origin_m = None if self.follows else stated_origin(self)  # poses that change may move theirs
+        return replace(frame, T_world_camera=T_world_camera, origin_m=origin_m)
 
     def pose_now(self, name: str, stamp_s: float) -> Pose | None:
         """The present pose (4, 4) of the frame with this name that was taken at this time; None if it is
