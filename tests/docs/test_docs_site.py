@@ -125,6 +125,16 @@ def test_pictures_are_small(repository: Path) -> None:
     assert sum(sizes.values()) < 1_000_000
 
 
+def test_decisions_are_short_and_the_newest_come_first(repository: Path) -> None:
+    text = (repository / "docs" / "decisions.md").read_text("utf-8")
+    dates = re.findall(r"^## (\d{4}-\d\d-\d\d)$", text, re.MULTILINE)
+    assert dates
+    assert dates == sorted(set(dates), reverse=True)
+    entries = re.findall(r"^### (.+)\n((?:(?!##).*\n?)*)", text, re.MULTILINE)
+    assert len(entries) == text.count("\n### ")
+    assert not [title for title, words in entries if len(words.split()) > 120]
+
+
 FILE = re.compile(r"`((?:[\w.-]+/)*[\w-]+\.(?:py|cpp|toml))`")
 PAGES = [
     *sorted((REPOSITORY / "docs").glob("*.md")),
