@@ -14,7 +14,7 @@ from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose
 from taichi_mrf.doctor.picture import overlap
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import atomic_path
 
@@ -31,7 +31,12 @@ def run_doctor(options: Doctor) -> int:
     reading = options.reading.keywords()
     said = conventions_of(reading["poses_are"], reading["mounting"], reading["depth_is"])
     as_written = {**reading, "poses_are": None, "mounting": None, "depth_is": AXIAL}
-    dataset = open_posed(options.source, options.poses, color=False, **as_written)
+    try:
+        dataset = open_posed(options.source, options.poses, color=False, **as_written)
+    except DatasetError:  # such as scans that are only read with the flag that their poses want
+        if as_written == reading:
+            raise
+        dataset = open_posed(options.source, options.poses, color=False, **reading)
     found = diagnose(dataset, said)
     if options.picture is not None:
         _write_picture(options.picture, found)

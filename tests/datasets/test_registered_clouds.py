@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from console import carry_out
 from datasets_recordings import row_of
 from point_clouds import Points, RoomWalk, write_pcd, write_ply
 from refusals import refused
@@ -54,13 +55,13 @@ def write(folder: Path, suffix: str, clouds: list[Points], poses: list[Pose] | N
     return folder
 
 
-def check_rays(dataset: Dataset, moved: float = 0.0) -> None:
+def check_rays(dataset: Dataset, moved: float = 0.0, world: Pose | None = None) -> None:
     """The scans are those of the sensor, at its poses."""
     for i, frame in enumerate(dataset):
         points = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3)
         off = np.sort(points, axis=0) - np.sort(ROOM.clouds[i], axis=0)  # rays have an order of their own
         np.testing.assert_allclose(off, 0.0, atol=2e-3)
-        T = ROOM.poses[i].copy()
+        T = ROOM.poses[i].copy() if world is None else world @ ROOM.poses[i]
         T[:2, 3] += moved
         np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-6)
 
@@ -75,15 +76,18 @@ def test_the_frame_of_points_is_found(tmp_path: Path, suffix: str, frame: str) -
     assert len(told) == (frame == "world")
 
 
-@pytest.mark.parametrize(
-    ("mistake", "flag"), [("inverse", "--poses-are inverse"), ("camera", "--mounting 0,0,0,")]
-)
-def test_poses_of_another_convention_are_named(tmp_path: Path, mistake: str, flag: str) -> None:
-    poses = ROOM.poses
-    poses = [np.linalg.inv(T) for T in poses] if mistake == "inverse" else as_of_camera(poses)
-    dataset = open_dataset(write(tmp_path, "ply", ROOM.clouds, poses))
-    assert any("clouds fit together best if" in note and flag in note for note in dataset.notes)
-    assert not any("?points=" in note for note in dataset.notes), "wrong poses make no points the world's"
+def test_poses_of_another_convention_are_refused(tmp_path: Path) -> None:
+    inverses = [np.linalg.inv(T) for T in ROOM.poses]
+    folder = write(tmp_path / "inverse", "ply", ROOM.clouds, inverses)
+    refused(folder, "clouds fit together best if", "--poses-are inverse")
+    check_rays(open_dataset(folder, poses_are="inverse"))
+    registered = write(tmp_path / "registered", "ply", ROOM.in_world(), inverses)
+    check_rays(open_dataset(registered, poses_are="inverse"))
+    camera = write(tmp_path / "camera", "ply", ROOM.clouds, as_of_camera(ROOM.poses))
+    refused(camera, "clouds fit together best if", "--mounting 0,0,0,0.5,-0.5,0.5,0.5")
+    mounted = open_dataset(camera, mounting=(0, 0, 0, 0.5, -0.5, 0.5, 0.5))
+    check_rays(mounted, world=T_CAMERA_LIDAR)
+    assert carry_out("doctor", folder, "--poses-are", "inverse") == 0
 
 
 @pytest.mark.parametrize("frame", ["sensor", "world"])

@@ -17,14 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.entries import velodyne_sequence
 from taichi_mrf.datasets.lidar.clouds import natural, number_of, read_cloud
 from taichi_mrf.datasets.lidar.registered import in_world, of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
+from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.pairs import read_times
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, read_trajectory
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.system.files import is_file, is_folder, read_text
 
@@ -52,9 +54,13 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
         found.append((file, stamp, by_number[number]))
-    world = in_world(
-        len(found), lambda i: _pose(found[i][2], T_camera_lidar), lambda i: read_cloud(found[i][0])
-    )
+    undo = options.conventions
+    with naming(str(folder)):
+        world = in_world(
+            len(found),
+            lambda i: pose_of(_pose(found[i][2], T_camera_lidar), undo),
+            lambda i: read_cloud(found[i][0]),
+        )
     if world:
         notes.append(
             "points are in the world's frame: clouds fit together as they are; rays begin at the poses"
@@ -62,7 +68,7 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
     scans = [
         RecordedScan(
             file.stem, stamp, partial(_pose, pose, T_camera_lidar), pose.source,
-            partial(_points, file, world), str(file),
+            partial(_points, file, world, undo), str(file),
         )
         for file, stamp, pose in found
     ]  # fmt: skip
@@ -118,6 +124,8 @@ def _pose(pose: RecordedPose, T_camera_lidar: Pose) -> Pose:
     return inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
 
 
-def _points(file: Path, world: bool | None, T_world_lidar: Pose) -> NDArray[np.float64]:
+def _points(
+    file: Path, world: bool | None, conventions: Conventions, T_recorded: Pose
+) -> NDArray[np.float64]:
     points_m = read_cloud(file)
-    return of_sensor(points_m, T_world_lidar) if world else points_m
+    return of_sensor(points_m, pose_of(T_recorded, conventions)) if world else points_m

@@ -4,7 +4,6 @@ Files do not tell. Registered clouds of neighbouring scans overlap as they are, 
 poses; and a scan lies around the place of its sensor, which sees all of its points and none behind another.
 """
 
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -53,8 +52,8 @@ def in_world(
     """True if points are in the world's frame, False if in the sensor's, None if nothing tells.
 
     Looks at a few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in
-    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Warns if poses are
-    clearly the inverse, or a camera's.
+    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Raises DatasetError
+    if poses are clearly the inverse, or a camera's.
     """
     votes, overlaps = [], []
     for first in np.unique(np.linspace(0, count, _PLACES + 1).astype(int)[:_PLACES]) if count else []:
@@ -80,7 +79,7 @@ def in_world(
     if as_they_are < min(_FITS_M, *(each / _CLEARLY for each in (posed, *wrong))):
         return True
     if min(wrong) < min(_FITS_M, posed / _TWICE, as_they_are / _TWICE):
-        warnings.warn(f"clouds fit together best if {_MISTAKES[int(np.argmin(wrong))]}", stacklevel=2)
+        raise DatasetError(f"clouds fit together best if {_MISTAKES[int(np.argmin(wrong))]}")
     return False if _CLEARLY * posed < as_they_are else None
 
 

@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd_header
 from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, of_sensor
 from taichi_mrf.datasets.lidar.scan_poses import POSES_NPZ, ScanPose, find_poses, poses_of
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
+from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import ReadOptions, parse_options
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import is_file, is_folder
 
@@ -75,11 +77,17 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     posed = [cloud for cloud in clouds if cloud in found]
     world = chosen.points == WORLD
     if not chosen.points:
-        world, frame = _frame_of(posed, found, poses is None)
+        with naming(str(path)):
+            world, frame = _frame_of(posed, found, poses is None, options.conventions)
         notes += frame
     scans = [
         RecordedScan(
-            cloud.stem, pose.stamp, pose.read, pose.source, partial(_points, cloud, world), str(cloud)
+            cloud.stem,
+            pose.stamp,
+            pose.read,
+            pose.source,
+            partial(_points, cloud, world, options.conventions),
+            str(cloud),
         )
         for cloud in posed
         for pose in (found[cloud],)
@@ -154,10 +162,15 @@ def _viewpoint(cloud: Path) -> Pose:
     return read_pcd_header(cloud).T_world_sensor()
 
 
-def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool) -> tuple[bool, list[str]]:
+def _frame_of(
+    clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool, conventions: Conventions
+) -> tuple[bool, list[str]]:
     """True if points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
-    better, and a note where it is not as documented."""
-    found = in_world(len(clouds), lambda i: poses[clouds[i]].read(), lambda i: read_cloud(clouds[i]))
+    better, and a note where it is not as documented. Raises DatasetError for poses in other
+    ``conventions``."""
+    found = in_world(
+        len(clouds), lambda i: pose_of(poses[clouds[i]].read(), conventions), lambda i: read_cloud(clouds[i])
+    )
     if found is None or found == viewpoints:
         told = ["VIEWPOINT is taken for the sensor's pose, and points for those of the world's frame"]
         return viewpoints, told if viewpoints else []
@@ -169,7 +182,7 @@ def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool)
     ]
 
 
-def _points(cloud: Path, world: bool, T_world_sensor: Pose) -> NDArray[np.float64]:
+def _points(cloud: Path, world: bool, conventions: Conventions, T_recorded: Pose) -> NDArray[np.float64]:
     """The points of a file in the sensor's frame, into which those of the ``world``'s are taken."""
     points_m = read_cloud(cloud)
-    return of_sensor(points_m, T_world_sensor) if world else points_m
+    return of_sensor(points_m, pose_of(T_recorded, conventions)) if world else points_m
