@@ -327,6 +327,51 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         assert narrow.problems == []
 
 
+def test_the_ground_and_the_axes_come_and_go(page: LivePage, saved: MRFMap) -> None:
+    levels_m, voxels = np.unique(saved.decided.voxels(0.5)[0][:, 2], return_counts=True)
+    floor_m = levels_m[np.argmax(voxels)]
+    assert abs(page.position("/ground")[2] - floor_m) < 1.01 * saved.voxel_size
+    assert "ground in squares of 1 m" in page.text()
+    for label, node in (("Ground", "/ground"), ("Axes", "/WorldAxes")):
+        page.tick(label, on=False)
+        page.until(lambda seen, node=node: node not in seen.nodes, f"no {node}")
+    assert "squares" not in page.text()
+    for label, node in (("Ground", "/ground"), ("Axes", "/WorldAxes")):
+        page.tick(label)
+        page.until(lambda seen, node=node: node in seen.nodes, node)
+
+
+def test_buttons_and_keys_show_the_whole_map_from_a_side(page: LivePage, saved: MRFMap) -> None:
+    places = page.places
+    edge = page.input("Follow").bounding_box()["x"] - 120  # where the panel begins
+    centres = saved.decided.voxels(0.5)[0]
+    low_m, high_m = centres.min(axis=0), centres.max(axis=0)
+
+    def fitted(axis: int, sign: int) -> bool:
+        """The eye looks at this side of the room; all is in the window, and nothing behind the panel."""
+        eye = np.array(page.position())
+        outside_m = np.maximum(low_m - eye, eye - high_m)
+        seen = np.array(places("/voxels/", "points"))
+        inside = (seen[:, :2] > 0).all() and (seen[:, 0] < edge).all() and (seen[:, 1] < 800).all()
+        return bool(inside and np.argmax(outside_m) == axis and np.sign(eye[axis]) == sign)
+
+    for press, axis, sign in (
+        (lambda: page.press("Top"), 2, 1),
+        (lambda: page.press("Front"), 1, -1),
+        (lambda: page.press("Side"), 0, 1),
+        (lambda: page.page.keyboard.press("1"), 2, 1),
+        (lambda: page.page.keyboard.press("2"), 1, -1),
+        (lambda: page.page.keyboard.press("3"), 0, 1),
+    ):
+        press()
+        page.until(lambda seen, axis=axis, sign=sign: fitted(axis, sign), f"axis {axis} from {sign}")
+    page.page.mouse.move(400, 600)
+    page.page.mouse.wheel(0, -600)
+    page.until(lambda seen: not fitted(0, 1), "a nearer view")
+    page.page.keyboard.press("0")
+    page.until(lambda seen: fitted(0, 1), "all of it again")
+
+
 def reset(page: LivePage) -> None:
     """Press Reset, and confirm it."""
     page.press("Reset")
@@ -335,7 +380,8 @@ def reset(page: LivePage) -> None:
 
 def test_the_view_follows_the_camera(page: LivePage) -> None:
     away = np.linalg.norm(np.subtract(page.position(), page.position("/camera")))
-    page.tick("Follow")
+    page.page.keyboard.press("f")
+    page.until(lambda seen: page.input("Follow").is_checked(), "the box beside it")
     page.select("Speed", "0.25x")  # or a machine that draws slowly sees only the end
     reset(page)
     places = set()

@@ -92,7 +92,8 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     running.take(m.Bricks("dynamic", brick, dynamic, seen, NOTHING))
     assert (len(colors(running)), red(running)) == (40, 7)
     running.page.show_counts()
-    assert running.page.panel._shown.content == "40 voxels shown, 7 dynamic"
+    shown = running.page.panel._shown.content
+    assert shown == "40 voxels shown, 7 dynamic · ground in squares of 0.1 m"
     running.page.options = replace(ViewOptions(), dynamic=False)
     running.page.map.look_changed()
     assert (len(colors(running)), red(running)) == (40, 0)

@@ -23,6 +23,7 @@ from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import Placement
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.transport.process import Inbox
 
 _PLAIN = ViewOptions(show="voxels")
@@ -60,6 +61,11 @@ class Page(BasePage[Panel]):
             Action.PAUSE: lambda client: ask(m.Pause(True)),
             Action.STEP: lambda client: ask(m.Step()),
             Action.SPEED: lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
+            Action.TOP: lambda client: self._look_from(client, "top"),
+            Action.FRONT: lambda client: self._look_from(client, "front"),
+            Action.SIDE: lambda client: self._look_from(client, "side"),
+            Action.FIT: lambda client: self._look_from(client, "here"),
+            Action.FOLLOW: lambda client: self.panel.set_following(),
             Action.RESET: self._reset,
             Action.RESET_CONFIRMED: self._reset_confirmed,
             Action.CANCELLED: self.panel.close_question,
@@ -87,6 +93,14 @@ class Page(BasePage[Panel]):
         self.viewpoint.set_following(self.options.follow)
         if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
+
+    def _look_from(self, client: int, side: Side) -> None:
+        """Show the whole map to one client, and follow the camera no more."""
+        self.panel.set_following(False)
+        self._take_options()
+        box = None if self.map is None else self.map.box_m()
+        if box is not None:
+            self.viewpoint.look_from(client, side, *box)
 
     def _begin(self, hello: m.Hello) -> None:
         """Start with an empty map."""

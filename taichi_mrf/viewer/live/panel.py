@@ -33,6 +33,11 @@ class Action(Enum):
     PAUSE = auto()
     STEP = auto()
     SPEED = auto()
+    TOP = auto()
+    FRONT = auto()
+    SIDE = auto()
+    FIT = auto()
+    FOLLOW = auto()
     RESET = auto()
     RESET_CONFIRMED = auto()
     CHOOSE_KEYFRAME = auto()
@@ -72,6 +77,17 @@ class Dragged(Event):
 RUN_BUTTONS = {
     "Play": Action.PLAY, "Pause": Action.PAUSE, "Step": Action.STEP, "Reset": Action.RESET,
 }  # fmt: skip
+VIEW_BUTTONS = {
+    "Top": Action.TOP, "Front": Action.FRONT, "Side": Action.SIDE, "Fit": Action.FIT,
+}  # fmt: skip
+COMMANDS = {
+    "Look from the top": (Action.TOP, "1"),
+    "Look from the front": (Action.FRONT, "2"),
+    "Look from the side": (Action.SIDE, "3"),
+    "Fit the whole map into the window": (Action.FIT, "0"),
+    "Follow the camera, or stop following": (Action.FOLLOW, "F"),
+}
+"""Entries of the command palette: action and key."""
 EDIT_BUTTONS = {
     "On/off": Action.SWITCH,
     "Freeze": Action.FREEZE,
@@ -101,18 +117,8 @@ NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
-    "show",
-    "color_by",
-    "threshold",
-    "size",
-    "shade",
-    "cut_axis",
-    "cut_at",
-    "bricks",
-    "show_baseline",
-)
-_PAGE_OPTIONS = ("follow", "pictures", "dark")
-_TIME_OPTIONS = ("dynamic",)
+    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "show_baseline",
+)  # fmt: skip
 TIME_STEP_S = 0.1
 
 
@@ -163,13 +169,20 @@ class Panel(BasePanel):
         self.watch(self.speed, Action.SPEED)
         self.add_legend()
         self.add_counts()
+        self.add_buttons("View", VIEW_BUTTONS, "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.")
+        self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
+        self._options.add("follow")
+        for label, (action, key) in COMMANDS.items():
+            self.add_command(label, action, key)
         self.time = TimeFolder(gui, self)
         with self.time.folder:
-            self._time_options = OptionWidgets(gui, ViewOptions(), self.options_moved, _TIME_OPTIONS)
+            self._options.add("dynamic")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
-            self._map_options = OptionWidgets(gui, ViewOptions(), self.options_moved, _MAP_OPTIONS)
-            self._page_options = OptionWidgets(gui, ViewOptions(), self.options_moved, _PAGE_OPTIONS)
+            self._options.add(*_MAP_OPTIONS)
+            with gui.add_folder("Space"):
+                self._options.add("ground", "axes")
+            self._options.add("pictures", "dark")
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
         with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
@@ -186,20 +199,14 @@ class Panel(BasePanel):
 
     def options(self) -> ViewOptions:
         """The view options as the widgets stand."""
-        parts = {
-            _PAGE_OPTIONS: self._page_options,
-            _MAP_OPTIONS: self._map_options,
-            _TIME_OPTIONS: self._time_options,
-        }
-        values = {name: getattr(widgets.value(), name) for names, widgets in parts.items() for name in names}
-        return ViewOptions(**values)
+        return self._options.value()
 
     def show_hello(self, hello: Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
-        self._map_options.offer("color_by", _colors_of(hello))
-        self._map_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
+        self._options.offer("color_by", _colors_of(hello))
+        self._options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -214,11 +221,16 @@ class Panel(BasePanel):
         """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
         self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
-        self._page_options.handles["follow"].visible = has_frames
+        self._options.handles["follow"].visible = has_frames
+
+    def set_following(self, on: bool | None = None) -> None:
+        """Set the box that follows the camera; None turns it over."""
+        box = self._options.handles["follow"]
+        box.value = (not box.value) if on is None else on
 
     def color_by_photo(self) -> None:
         """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
-        widget = self._map_options.handles["color_by"]
+        widget = self._options.handles["color_by"]
         if widget.value == ViewOptions().color_by:
             widget.value = "photo"
 

@@ -102,7 +102,7 @@ class BasePage(Generic[P]):
     def show_counts(self) -> None:
         """Show how much of what the page shows, or will show in a moment."""
         if self.map is not None:
-            self.panel.show_counts(self.map.counts(), self.downloads.is_recording)
+            self.panel.show_counts(self.map.counts(), self.map.ground.square_m, self.downloads.is_recording)
 
     def _announce(self) -> None:
         self.show_counts()
@@ -135,6 +135,7 @@ class BasePage(Generic[P]):
         crossed = self.keyframes.roster.crossed()
         if not self.map.flush(self.options, self.viewpoint.up, crossed, self._announce):
             return
+        self.show_counts()
         with_baseline = bool(self.map.layers["baseline"].store.chunks)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline

@@ -69,11 +69,16 @@ class BasePanel:
         button.on_click(lambda event: self._used(event, action))
         return button
 
-    def add_buttons(self, label: str, actions: Mapping[str, Enum]) -> Any:
+    def add_buttons(self, label: str, actions: Mapping[str, Enum], hint: str | None = None) -> Any:
         """Add a row of buttons: what is written on each, and its action."""
-        group = self.gui.add_button_group(label, tuple(actions))
+        group = self.gui.add_button_group(label, tuple(actions), hint=hint)
         group.on_click(lambda event: self._used(event, actions[event.target.value]))
         return group
+
+    def add_command(self, label: str, action: Enum, key: Any, modifier: Any = None) -> None:
+        """Add an entry of the command palette (Ctrl-K) with a key; keys do nothing while text is typed."""
+        command = self.gui.add_command(label, hotkey=key, modifier=modifier)
+        command.on_trigger(lambda event: self._used(event, action))
 
     def watch(self, widget: Any, action: Enum) -> None:
         """Take each change of a widget's value by a user as this action; the page's own changes are none."""
@@ -85,13 +90,14 @@ class BasePanel:
         self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
         self._progress.animated = moving
 
-    def show_counts(self, counts: Mapping[str, int], recording: bool) -> None:
-        """Show how much the page shows, by the names that MapScene.counts has, and whether the scene is being
-        recorded."""
+    def show_counts(self, counts: Mapping[str, int], square_m: float | None, recording: bool) -> None:
+        """Show how much the page shows, by the names that MapScene.counts has, how wide the squares on the
+        ground are if there are any, and whether the scene is being recorded."""
         surface = counts["triangles"]
         what = f"{surface:,} triangles of the measured surface" if surface else f"{counts['map']:,} voxels"
         text = f"{what} shown"
         text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
+        text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
         self._shown.content = text + (" · recording" if recording else "")
 
     def show_legend(self, legend_html: str) -> None:
@@ -108,7 +114,7 @@ class BasePanel:
         self._notices.clear()
         self._notice_list.content = notices_html([])
 
-    def _used(self, event: viser.GuiEvent, action: Enum) -> None:
+    def _used(self, event: viser.GuiEvent | viser.CommandEvent, action: Enum) -> None:
         if event.client_id is not None:
             self._tell(Used(action, event.client_id))
 

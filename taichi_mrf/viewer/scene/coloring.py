@@ -57,6 +57,12 @@ class ViewOptions:
     bricks: bool = False
     """Draw the outlines of the map's bricks of 8 x 8 x 8 voxels."""
 
+    ground: bool = True
+    """Draw squares on the ground, below the lowest large surface; a label says how wide they are."""
+
+    axes: bool = True
+    """Draw the axes of the world at its origin: x red, y green, z blue."""
+
     pictures: bool = True
     """Show each keyframe's depth image in its frustum."""
 

@@ -5,6 +5,7 @@ Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times a secon
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Literal
 
 import numpy as np
 import viser
@@ -26,13 +27,20 @@ _GAP_M = 0.5
 """Distance between the map and the baseline's map, in metres."""
 
 
+_LOWEST_SHARE = 0.02
+"""Share of the voxels that may lie below the ground: those that noise has put there."""
+
+_SQUARES_ACROSS = 8
+"""The ground has about so many squares along the map's longer side."""
+
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 _OUTLINE_COLOR = (120, 120, 120)
 _OUTLINE_NODE = "/bricks"
+_GROUND_COLOR = (160, 165, 172)
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /surface, /baseline, /cut, /bricks and /names."""
+    """Owns the scene nodes /voxels, /surface, /baseline, /cut, /bricks, /ground and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -47,6 +55,7 @@ class MapScene:
         """True while frames are read: a surface that was made before lacks what they add."""
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
+        self.ground = Ground(server.scene)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
         self._all_dirty = True
         self._look: Look | None = None
@@ -120,6 +129,7 @@ class MapScene:
         self.surface.clear()
         self._cut_plane.hide()
         self._brick_lines.hide()
+        self.ground.hide()
         for name in _NAMES:
             self._server.scene.remove_by_name(f"/names/{name}")
 
@@ -170,6 +180,7 @@ class MapScene:
             if map_changed:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)
+                self._show_space(options, up)
             if any_changed:
                 self.layers["baseline"].place(self._baseline_m(up))
                 self._draw_names(up)
@@ -181,6 +192,19 @@ class MapScene:
         self.surface.send(visible)
         if self._voxels.visible == visible:
             self._voxels.visible = not visible
+
+    def _show_space(self, options: ViewOptions, up: Up) -> None:
+        """Show the axes, and the ground under the map while that has the same box."""
+        box = self.box_m()
+        if box is None or not options.ground:
+            self.ground.hide()
+        elif not self.ground.lies_below(*box):
+            points = self.layers["map"].points()
+            if len(points):
+                height_m = up[1] * float(np.quantile(up[1] * points[:, up[0]], _LOWEST_SHARE))
+                self.ground.show(*box, up, height_m - up[1] * 0.5 * self._hello.voxel_size)
+        if self._server.scene.world_axes.visible != options.axes:
+            self._server.scene.world_axes.visible = options.axes
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
         if look.cut is None:
@@ -256,3 +280,57 @@ class BrickLines:
         if self._node is not None:
             self._node.remove()
             self._node = None
+
+
+def square_m(extent_m: float) -> float:
+    """Width of the ground's squares below a map that is so wide: 1, 2 or 5 times a power of ten."""
+    least = max(extent_m / _SQUARES_ACROSS, 1e-3)
+    power = 10.0 ** np.floor(np.log10(least))
+    return float(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= 0.999 * least))
+
+
+class Ground:
+    """Owns the grid in the scene, and the label with the width of its squares: ``square_m``, None without."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._box_m: NDArray[np.float64] | None = None
+        self.square_m: float | None = None
+
+    def lies_below(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> bool:
+        """True if the grid is that of the box from ``low`` to ``high`` (metres, world)."""
+        return self._box_m is not None and np.array_equal(self._box_m, [low, high])
+
+    def show(self, low: NDArray[np.float64], high: NDArray[np.float64], up: Up, height_m: float) -> None:
+        """Draw the grid at a coordinate ``height_m`` on the axis ``up``, with lines at whole multiples of a
+        square's width, around the box from ``low`` to ``high``."""
+        self._box_m = np.stack([low, high])
+        level = [axis for axis in range(3) if axis != up[0]]
+        square = self.square_m = square_m(float((high - low)[level].max()))
+        first, last = np.floor(low / square) - 1, np.ceil(high / square) + 1
+        last += (last - first) % 2  # viser draws lines from the middle on
+        place = 0.5 * square * (first + last)
+        place[up[0]] = height_m
+        width, height = (square * (last - first))[level]
+        plane: Literal["yz", "xz", "xy"] = ("yz", "xz", "xy")[up[0]]
+        self._scene.add_grid(
+            "/ground",
+            float(width),
+            float(height),
+            plane=plane,
+            cell_thickness=0.0,
+            section_size=square,
+            section_color=_GROUND_COLOR,
+            shadow_opacity=0.0,
+            fade_strength=0.0,
+            position=place,
+        )
+        corner = square * first
+        corner[up[0]] = height_m
+        self._scene.add_label("/ground/square", f"squares of {square:g} m", position=corner - place)
+
+    def hide(self) -> None:
+        """Remove the grid from the scene."""
+        if self._box_m is not None:
+            self._scene.remove_by_name("/ground")
+            self._box_m = self.square_m = None

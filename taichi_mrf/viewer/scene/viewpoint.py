@@ -1,6 +1,7 @@
 """The viewpoint of the browsers: a view of the whole map at first, and a view that follows the camera."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import viser
@@ -9,6 +10,9 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import SurfaceView
+
+Side = Literal["top", "front", "side", "here"]
+"""From where to look at the whole map; *here* is the direction from where a browser looks now."""
 
 _GROWTH = 1.2
 """The first view is chosen again when the map has grown by this factor."""
@@ -23,6 +27,12 @@ window's width: the panel covers the right side."""
 
 _ASPECT = 1.6
 """Width over height of a usual window."""
+
+_PANEL_OF_WINDOW, _MARGIN = 0.27, 1.05
+"""Share of a usual window's width that the panel covers; and the eye's distance over the least one."""
+
+_UPRIGHT = 1e-3
+"""The view from the top is so much off the vertical that the front is at the window's lower edge."""
 
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 _WIDE_RAD = np.deg2rad(75.0)
@@ -84,6 +94,27 @@ class ViewpointController:
             self._following = on
             self._begin_there()
             self._follow()
+
+    def look_from(self, client: int, side: Side, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Show one browser the whole box from ``low`` to ``high`` (metres, world) from a side, or from where
+        it looks now; its user has then chosen a view."""
+        handle = self._server.get_clients().get(client)
+        if handle is None:
+            return
+        camera, up = handle.camera, up_vector(self.up)
+        front = -np.eye(3)[max(axis for axis in range(3) if axis != self.up[0])]
+        sides = {"top": up + _UPRIGHT * front, "front": front, "side": np.cross(up, front)}
+        towards = _unit(sides[side] if side in sides else camera.position - camera.look_at)
+        right = _unit(np.cross(up, towards))
+        above = np.cross(towards, right)
+        wide, tall = camera.aspect * np.tan(0.5 * _WIDE_RAD), np.tan(0.5 * _WIDE_RAD)
+        covered = _PANEL_OF_WINDOW if camera.aspect > 1 else 0.0
+        corners = (np.array(list(np.ndindex(2, 2, 2))) - 0.5) * (high - low)
+        aside = np.maximum(np.abs(corners @ right) / (wide * (1 - covered)), np.abs(corners @ above) / tall)
+        distance = _MARGIN * float((corners @ towards + aside).max())
+        target = (low + high) / 2 + covered * distance * wide * right
+        self._point(handle, _View(target + distance * towards, target, up))
+        del self._placed[client]
 
     def look_at_everything(self) -> None:
         """Choose the view again at the next :meth:`map_grew`; a view that a user has chosen stays."""
@@ -167,3 +198,7 @@ class ViewpointController:
             client.camera.look_at = view.target_m
             client.camera.fov = view.fov_rad
         self._placed[client.client_id] = view.eye_m
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vector / np.linalg.norm(vector), np.float64)

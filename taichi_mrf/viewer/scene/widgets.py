@@ -51,23 +51,20 @@ class OptionWidgets(Generic[T]):
     """One widget for each field of a dataclass: a slider for a number with a Range, a dropdown for a Literal,
     a checkbox for a bool."""
 
-    def __init__(
-        self, gui: viser.GuiApi, options: T, changed: Callable[[], None], only: tuple[str, ...] = ()
-    ) -> None:
-        """Add the widgets for all fields, or ``only`` for these, at the place where the GUI stands.
-        ``changed`` is called, on some thread, after any of them was moved."""
-        cls: type[Any] = type(options)
-        hints = typing.get_type_hints(cls, include_extras=True)
-        texts = field_help(cls)
-        self._options: Any = options
+    def __init__(self, gui: viser.GuiApi, options: T, changed: Callable[[], None]) -> None:
+        """``changed`` is called, on some thread, after any of the widgets was moved."""
+        self._gui, self._options, self._changed = gui, options, changed
         self.handles: dict[str, Any] = {}
-        for field in dataclasses.fields(cls):
-            if only and field.name not in only:
-                continue
-            value = getattr(options, field.name)
-            handle = add_widget(gui, label_of(field.name), hints[field.name], value, texts[field.name])
-            handle.on_update(lambda event: changed())
-            self.handles[field.name] = handle
+
+    def add(self, *names: str) -> None:
+        """Add the widgets of these fields, of all without a name, at the place where the GUI stands."""
+        cls: type[Any] = type(self._options)
+        hints, texts = typing.get_type_hints(cls, include_extras=True), field_help(cls)
+        for name in names or tuple(hints):
+            value = getattr(self._options, name)
+            handle = add_widget(self._gui, label_of(name), hints[name], value, texts[name])
+            handle.on_update(lambda event: self._changed())
+            self.handles[name] = handle
 
     def offer(self, name: str, choices: Sequence[str]) -> None:
         """Let a dropdown offer these choices only."""
@@ -77,7 +74,8 @@ class OptionWidgets(Generic[T]):
     def value(self) -> T:
         """The options with the values of the widgets."""
         values = {name: handle.value for name, handle in self.handles.items()}
-        result: T = dataclasses.replace(self._options, **values)
+        options: Any = self._options
+        result: T = dataclasses.replace(options, **values)
         return result
 
 

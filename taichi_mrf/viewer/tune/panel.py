@@ -56,7 +56,8 @@ SAVE_BUTTONS = {
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
-    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "pictures", "dark",
+    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "ground", "axes", "pictures",
+    "dark",
 )  # fmt: skip
 
 _OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
@@ -104,11 +105,13 @@ class TunePanel(BasePanel):
             self._tries_tab()
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self.add_legend()
-            self._options = OptionWidgets(gui, ViewOptions(), self.options_moved, MAP_OPTIONS)
+            self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
+            self._options.add(*MAP_OPTIONS)
             self._options.offer("color_by", OF_BELIEFS)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
             self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
+            self._frames.add()
             hint = "Start again with these frames. The table of tries is emptied."
             self.add_button("Use these frames", Action.USE_FRAMES, hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
