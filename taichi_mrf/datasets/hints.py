@@ -88,6 +88,11 @@ def hint_for(path: Path) -> str | None:
         )
     if path.suffix == ".zarr" and is_folder(path):
         return f"{_SAVED_MAP}: taichi-mrf info, export and diff read it, and live shows the map.npz of a run"
+    if is_folder(path / "rtabmap_depth"):
+        return (
+            "is what rtabmap-export has written; pass the database itself (rtabmap.db), which has the poses, "
+            "the cameras and where they are mounted"
+        )
     if not is_folder(path):
         return image_hint([path], "is one image") if path.suffix.lower() in _IMAGES else _kind(path)
     if is_file(path / "map.npz"):

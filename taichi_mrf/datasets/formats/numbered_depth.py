@@ -1,7 +1,8 @@
 """ICL-NUIM, Redwood and their like: numbered depth PNGs and one file with the trajectory.
 
 The images lie in the folder itself or in ``depth/`` (colour in ``rgb/``, ``color/`` or ``image/``). The
-trajectory's layout decides the defaults:
+trajectory may be ``scene/trajectory.log``, where Open3D's reconstruction system writes it; its layout decides
+the defaults:
 
 - stamped (``*.freiburg``; Handa et al., ICRA 2014): the stamp is the image's number; ICL-NUIM's camera, 5000
   steps a metre. ICL-NUIM's world and camera have y up and are left-handed (its fy is -480); both are
@@ -49,6 +50,7 @@ from taichi_mrf.system.files import is_file
 NAME = "ICL-NUIM / Redwood"
 ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
 FRAMES_PER_SECOND = 30.0
+OPEN3D_LOG = "scene/trajectory.log"
 COLOR_FOLDERS = ("rgb", "color", "image")
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -105,7 +107,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
         for path in sorted(folder.iterdir())
         if (path.suffix in suffixes and path.name not in CAMERA_FILES and is_trajectory(path))
         or (path.suffix == ".json" and is_trajectory_json(path))
-    ]
+    ] or [path for path in (folder / OPEN3D_LOG,) if is_file(path)]
     if not candidates and may_lack and any(map(holds_depth, images[:2])):
         return None
     if len(candidates) != 1 and (hint := pose_files_hint(folder, images)):
