@@ -33,7 +33,7 @@ _POSITION, _ROTATION = (
 _STAMP = re.compile(r".*(?:time|stamp|secs?$).*|t|ts")
 _HEADER_STAMP = re.compile(r".*header[._]+stamp")
 """Of a message: rostopic names the time of its arrival too, before it."""
-_NANOSECONDS = re.compile(r".*[._]n(?:ano)?secs?")
+_NANOSECONDS = re.compile(r"(?:.*[._])?n(?:ano)?secs?")
 _UNITS = {"ns": 1e9, "nsec": 1e9, "nanoseconds": 1e9, "us": 1e6, "usec": 1e6, "ms": 1e3, "msec": 1e3}
 _MAGNITUDES = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
 """Numbers from the first are stamps since 1970 of so many a second."""

@@ -211,6 +211,14 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "JSON": (jsons, "5 files such as frame_00000.json may hold.*--poses-are opengl"),
     "nerfstudio": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json.*--poses-are opengl"),
     "depth as npy": (npy, "format that is not read .0.npy"),
+    "raw KITTI": (
+        lambda f: (shutil.rmtree(f / "depth"), (f / "oxts").mkdir()),
+        "raw recording of KITTI's, whose oxts/ holds latitudes",
+    ),
+    "angles": (
+        lambda f: (f / "groundtruth.csv").write_text("1,2,3,4,.1,.2,.3"),
+        "no quaternion; angles are not read; --poses FILE",
+    ),
     "rtabmap-export": (
         lambda f: shutil.move(f / "depth", f / "rtabmap_depth"),
         "what rtabmap-export has written; pass the database itself",

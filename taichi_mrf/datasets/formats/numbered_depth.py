@@ -16,7 +16,6 @@ A camera file in the folder or the caller's options replace all of these. An ass
 against the poses (depth_scale.py), and the notes name what was assumed.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -27,7 +26,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import NUMBERED_FILES, NUMBERED_IMAGE, numbered_images
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
-from taichi_mrf.datasets.hints import image_hint, pose_files_hint
+from taichi_mrf.datasets.hints import image_hint, pose_files_hint, unread_poses
 from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera, own_cameras
 from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
@@ -116,8 +115,8 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
         raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
         raise DatasetError(
-            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}; "
-            f"{OTHERWISE}"
+            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}"
+            f"{unread_poses(folder)}; {OTHERWISE}"
         )
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
@@ -127,22 +126,6 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
     if candidates[0].suffix == ".json":
         return read_trajectory_json(candidates[0])
     return read_trajectory(candidates[0])
-
-
-def _unread(folder: Path) -> str:
-    """Problem of a text file whose name says that it holds poses, in words."""
-    if is_file(folder / "transforms.json"):
-        return (
-            ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "
-            "into poses.txt, and pass --poses-are opengl and --camera fl_x,fl_y,cx,cy"
-        )
-    for path in sorted(folder.glob("*.txt")):
-        if re.search("pose|traj|groundtruth", path.name, re.IGNORECASE):
-            try:
-                read_trajectory(path)
-            except DatasetError as error:
-                return f". {error}"
-    return ""
 
 
 def _poses_by_number(
