@@ -12,7 +12,7 @@ from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.laser.readers import holds_scans
 from taichi_mrf.datasets.lidar.clouds import is_cloud
 from taichi_mrf.datasets.lidar.ply_file import read_ply_header
-from taichi_mrf.datasets.trajectories import is_trajectory
+from taichi_mrf.datasets.trajectories import is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import is_file, is_folder, read_text
 from taichi_mrf.system.npz_file import open_npz
@@ -42,6 +42,11 @@ _BY_ENDING = {
         (".xyz", ".pts", ".asc", ".ptx", ".e57"),
         "is a point cloud in a format that is not read; convert each scan to a .ply or .pcd of its own, and "
         "put a file of the sensor's poses beside them",
+    ),
+    **dict.fromkeys(
+        (".lvx", ".lvx2", ".zbf", ".fls", ".vpcap"),
+        "is a scanner maker's own format, which is not read; convert it to a ROS bag with PointCloud2 and "
+        "poses, or each scan to a .ply or .pcd of its own with a file of the sensor's poses beside them",
     ),
     **dict.fromkeys(
         (".bt", ".ot"), "contains an OctoMap ({name}), not depth images; taichi-mrf import reads it"
@@ -88,6 +93,16 @@ def hint_for(path: Path) -> str | None:
         )
     if path.suffix == ".zarr" and is_folder(path):
         return f"{_SAVED_MAP}: taichi-mrf info, export and diff read it, and live shows the map.npz of a run"
+    if is_folder(path / "oxts"):
+        return (
+            "is a raw recording of KITTI's, whose oxts/ holds latitudes and angles: write the sensor's poses "
+            "as rows of 12 numbers into poses.txt (pykitti computes them), beside a folder with the scans"
+        )
+    if is_folder(path / "rtabmap_depth"):
+        return (
+            "is what rtabmap-export has written; pass the database itself (rtabmap.db), which has the poses, "
+            "the cameras and where they are mounted"
+        )
     if not is_folder(path):
         return image_hint([path], "is one image") if path.suffix.lower() in _IMAGES else _kind(path)
     if is_file(path / "map.npz"):
@@ -205,3 +220,23 @@ def _pose_file_hint(texts: Sequence[Path], remedy: str) -> str | None:
         f"{len(texts)} text files such as {texts[0].name} hold one pose each, in a layout that is not read: "
         f"{remedy}, and pass {flags} and --depth-scale (1000 for millimetres)"
     )
+
+
+def unread_poses(folder: Path) -> str:
+    """Problem of a text file whose name says that it holds poses, in words."""
+    if is_file(folder / "transforms.json"):
+        return (
+            ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "
+            "into poses.txt, and pass --poses-are opengl and --camera fl_x,fl_y,cx,cy"
+        )
+    for path in sorted([*folder.glob("*.txt"), *folder.glob("*.csv")]):
+        if re.search("pose|traj|groundtruth", path.name, re.IGNORECASE):
+            try:
+                read_trajectory(path)
+            except DatasetError as error:
+                return f". {error}"
+            if not is_trajectory(path):
+                return (
+                    f". {path}: seven numbers, of which the last four are no quaternion; angles are not read"
+                )
+    return ""

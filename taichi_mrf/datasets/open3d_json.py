@@ -71,8 +71,9 @@ def _focal(intrinsic: dict[str, Any]) -> Any:
 def _camera(path: Path | str, values: Any) -> PinholeCamera:
     try:
         width, height = int(values["width"]), int(values["height"])
-        columns = np.array([float(value) for value in values["intrinsic_matrix"]]).reshape(3, 3)
-        return PinholeCamera.from_matrix(width, height, columns.T)
+        matrix = np.array([float(value) for value in values["intrinsic_matrix"]]).reshape(3, 3)
+        by_rows = matrix[2].tolist() == [0, 0, 1]  # as they are written by hand
+        return PinholeCamera.from_matrix(width, height, matrix if by_rows else matrix.T)
     except ConfigError as error:
         raise DatasetError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, OverflowError):

@@ -22,6 +22,7 @@ Line = tuple[int, list[float]]
 _COUNTS, _DECIMAL = (7, 8, 12, 13, 16, 17), re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 """Numbers a line, of which each may have a decimal comma, where blanks separate them."""
 
+_COLMAP = re.compile(r"\s*(#.*\s+)*#\s*IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME")
 _AROUND = " \t\"'"
 _COMMENT = re.compile(r"(?:#|%|//)+")
 _UNIT = re.compile(r"[\[(].*?[\])]")
@@ -30,7 +31,9 @@ _POSITION, _ROTATION = (
     re.compile(r"q.*|.*[._]q|.*(?:quat|orient|rot).*"),
 )
 _STAMP = re.compile(r".*(?:time|stamp|secs?$).*|t|ts")
-_NANOSECONDS = re.compile(r".*[._]n(?:ano)?secs?")
+_HEADER_STAMP = re.compile(r".*header[._]+stamp")
+"""Of a message: rostopic names the time of its arrival too, before it."""
+_NANOSECONDS = re.compile(r"(?:.*[._])?n(?:ano)?secs?")
 _UNITS = {"ns": 1e9, "nsec": 1e9, "nanoseconds": 1e9, "us": 1e6, "usec": 1e6, "ms": 1e3, "msec": 1e3}
 _MAGNITUDES = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
 """Numbers from the first are stamps since 1970 of so many a second."""
@@ -54,7 +57,13 @@ class Columns:
 def lines_of_numbers(path: Path) -> list[Line]:
     """All lines of a file with their numbers: 8 or 7, in the order of :class:`Columns`, where a header names
     the columns. Raises DatasetError, which names the file and the line."""
-    columns, found = split(read_text(path, DatasetError).splitlines())
+    text = read_text(path, DatasetError)
+    if _COLMAP.match(text):
+        raise DatasetError(
+            f"{path}: is COLMAP's list of images: its poses are T_camera_world, and in no known unit; write "
+            "T_world_camera in metres, for each image the 12 numbers of the first three rows in a line"
+        )
+    columns, found = split(text.splitlines())
     lines = []
     for number, text in found:
         try:
@@ -124,7 +133,7 @@ def _named(head: str) -> Columns | None:
     for place, name in enumerate(names):
         bare = _UNIT.sub("", name).strip()
         field = _field(bare)
-        if field is not None and field not in places:
+        if field is not None and (field not in places or _HEADER_STAMP.fullmatch(bare)):
             places[field] = place
     wanted = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     if any(name not in places for name in wanted):

@@ -41,15 +41,17 @@ class RecordedFrame(Row):
 class Recording(Table[RecordedFrame]):
     """Frames in files, read on request.
 
-    ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
-    ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``color_camera`` took the
-    colour images, unless they are registered to depth.
+    ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from. Unless it
+    is the caller's or ``scale_stated`` by a file, :meth:`check_scale` may find another. If it is
+    ``scale_assumed``, not even the format says so. ``color_camera`` took the colour images, unless they are
+    registered to depth.
     """
 
     camera: PinholeCamera
     steps_per_metre: float = 1000.0
     scale_source: str = "the format's"
     scale_assumed: bool = False
+    scale_stated: bool = False
     color: bool = True
     color_camera: ColorCamera | None = None
 
@@ -89,8 +91,8 @@ class Recording(Table[RecordedFrame]):
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Compare neighbouring frames at the recorded poses, and note which scale is used and why.
 
-        An assumed scale is replaced by a usual one with which neighbouring frames agree clearly better; one
-        that a file or the caller gives is kept, and a note says that another would agree better.
+        A scale of the format is replaced by a usual one with which neighbouring frames agree clearly better;
+        one that a file or the caller gives is kept, and a note says that another would agree better.
         """
         apart = max(1, len(self.rows) // _LOOKED_AT)
         looked = [
@@ -109,7 +111,8 @@ class Recording(Table[RecordedFrame]):
         )
         notes = note_of_largest([share for _, share in looked])
         better = found.better_than(own)
-        if better is not None and self.scale_assumed:
+        is_given = self.scale_stated or self.scale_source == ASKED
+        if better is not None and not is_given:
             self.steps_per_metre = better
             notes.append(
                 f"depth: {better:g} steps per metre, found by comparing neighbouring frames at the recorded "

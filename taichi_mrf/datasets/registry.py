@@ -20,6 +20,9 @@ from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings, nam
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
+_NOT_ALONE = re.compile(r"(rgb|colou?r|left|right)s?([-_].*)?|.*[-_](rgb|colou?r)|rtabmap_.*", re.IGNORECASE)
+"""Folders with a part of a recording, such as its colours."""
+
 _FEW = 5
 """A folder around a recording has fewer things in it, such as a text about it."""
 
@@ -149,7 +152,7 @@ def _not_recognised(path: Path) -> str:
     """Why a path cannot be opened, and what to do."""
     if is_folder(path):
         children = sorted(path.iterdir())
-        inside = [child.name for child in children if is_bag(child) or _is_recording(child)]
+        inside = [child.name for child in _recordings(children)]
         if inside:
             return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
     hint = resolve_name("taichi_mrf.datasets.hints:hint_for")(path)
@@ -172,7 +175,7 @@ def _only_inside(path: Path) -> Path | None:
     if not is_folder(path):
         return None
     children = [child for child in path.iterdir() if not child.name.startswith((".", "__"))]
-    inside = [child for child in children if is_bag(child) or _is_recording(child)]
+    inside = _recordings(children)
     folders = [child for child in children if is_folder(child)]
     if inside:
         return inside[0] if len(inside) == 1 else None
@@ -184,8 +187,14 @@ def _formats() -> tuple[Format, ...]:
     return (*plugs()[0], *FORMATS)
 
 
-def _is_recording(path: Path) -> bool:
-    return is_folder(path) and recognise(path) is not None
+def _recordings(children: list[Path]) -> list[Path]:
+    """The recordings among what is in a folder; a folder with a part of one, such as its colours, is none."""
+    return [
+        child
+        for child in children
+        if is_bag(child)
+        or (is_folder(child) and not _NOT_ALONE.fullmatch(child.name) and recognise(child) is not None)
+    ]
 
 
 def _open_built_in(source: str, options: ReadOptions) -> Dataset:

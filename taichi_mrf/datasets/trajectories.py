@@ -1,7 +1,8 @@
 """Text files of poses, in the layouts that depth-camera recordings use.
 
 - ``stamped``: ``stamp tx ty tz qx qy qz qw`` a line (TUM RGB-D, the freiburg files of ICL-NUIM), or by the
-  names of columns (EuRoC). Stamps are seconds; ms, us or ns since 1970 are told by their size
+  names of columns (EuRoC), or a stamp and the matrix (MulRan). Stamps are seconds; ms, us or ns since 1970
+  are told by their size
 - ``rows``: the 3 x 4 or 4 x 4 matrix, row by row, or tx ty tz qx qy qz qw, in one line for each frame
 - ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
   the four rows of the 4 x 4 matrix; or KITTI-360's lines of the number and the matrix
@@ -13,8 +14,8 @@ can still be used.
 
 import re
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -83,7 +84,8 @@ def read_trajectory(path: Path) -> Trajectory:
     if not lines:
         raise DatasetError(f"{path}: contains no pose")
     columns = len(lines[0][1])
-    if columns == 8:
+    matrices = columns in (13, 17)
+    if columns == 8 or (matrices and _are_stamps([values[0] for _, values in lines])):
         known = [line for line in lines if np.isfinite(line[1][0])]
         if not known:
             raise DatasetError(f"{path} line {lines[0][0]}: the stamp is not finite")
@@ -97,7 +99,7 @@ def read_trajectory(path: Path) -> Trajectory:
         poses = _longest_run(path, tuple(_stamped(path, line, rate) for line in known))
         _warn_of_twice(path, poses)
         return Trajectory(path, "stamped", poses)
-    if columns in (13, 17):  # KITTI-360: the frame's number, and the matrix
+    if matrices:  # KITTI-360: the frame's number, and the matrix
         return Trajectory(path, "log", tuple(_numbered(path, line) for line in lines))
     if columns in (7, 12, 16):
         return Trajectory(path, "rows", tuple(_row(path, i, line) for i, line in enumerate(lines)))
@@ -221,8 +223,15 @@ def rotation_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _stamped(path: Path, line: Line, rate: float) -> RecordedPose:
     number, values = line
+    if len(values) in (13, 17):
+        return replace(_numbered(path, line), key=values[0] / rate)
     _expect(path, line, 8)
     return RecordedPose(values[0] / rate, np.array(values[1:], float), f"{path} line {number}")
+
+
+def _are_stamps(keys: Sequence[float]) -> bool:
+    """True if the numbers before matrices are times since 1970, as MulRan has them, or have fractions."""
+    return stamps_a_second(keys) != 1 or any(key % 1 for key in keys if np.isfinite(key))
 
 
 def _row(path: Path, index: int, line: Line) -> RecordedPose:
@@ -237,8 +246,6 @@ def _numbered(path: Path, line: Line) -> RecordedPose:
     number, values = line
     if len(values) not in (13, 17):
         _expect(path, line, 13)
-    if not float(values[0]).is_integer():
-        raise DatasetError(f"{path} line {number}: {values[0]} is no number of a frame")
     return RecordedPose(values[0], np.reshape(values[1:], (-1, 4)).astype(float), f"{path} line {number}")
 
 

@@ -191,8 +191,10 @@ ROS = (
     [
         [EUROC, "12500000000,1,2,3,0.8,0,0.6,0,9,9,9,9,9,9,9,9,9"],
         [ROS, "12.5,world,1,2,3,0,0.6,0,0.8"],
+        [ROS.replace("frame_id", "stamp"), "1600000000000000000,12.5,1,2,3,0,0.6,0,0.8"],  # and of arrival
         ["# a walk", "# timestamp qw qx qy qz tx ty tz", "12.5 0.8 0 0.6 0 1 2 3"],
         ["A walk", '"px";"py";"pz";"qx";"qy";"qz";"qw";"Time (s)"', '1;2;"3";"0";"0.6";"0";"0.8";"12.5"'],
+        ["#sec,nsec,x,y,z,qx,qy,qz,qw", "12,500000000,1,2,3,0,0.6,0,0.8"],
         ["header.stamp.sec,header.stamp.nanosec,x,y,z,qx,qy,qz,qw", "12,500000000,1,2,3,0,.6,0,.8"],
         ["// no names", "12.5\t1\t2\t3\t0\t0.6\t0\t0.8\t"],
         ["% stamp x y z qx qy qz qw", "12.5, 1, 2, 3, 0, 0.6, 0, 0.8,"],
@@ -205,6 +207,25 @@ def test_columns_are_found_by_their_names(tmp_path: Path, lines: list[str]) -> N
     (pose,) = read_trajectory(path).poses
     assert pose.key == pytest.approx(12.5)
     np.testing.assert_array_equal(pose.values, [1, 2, 3, 0, 0.6, 0, 0.8])
+
+
+@pytest.mark.parametrize(("stamp", "key"), [("1600000000500000000", 1.6e9 + 0.5), ("12.5", 12.5)])
+def test_a_stamp_before_a_matrix_is_no_number_of_a_frame(tmp_path: Path, stamp: str, key: float) -> None:
+    path = write(tmp_path / "poses.csv", f"{stamp},1,0,0,1,0,1,0,2,0,0,1,3")
+    trajectory = read_trajectory(path)
+    assert trajectory.layout == "stamped"
+    (pose,) = trajectory.poses
+    assert pose.key == pytest.approx(key, abs=1e-6)
+    np.testing.assert_array_equal(pose.T_world_camera()[:3, 3], [1, 2, 3])
+
+
+def test_the_list_of_colmap_is_refused(tmp_path: Path) -> None:
+    head = "# Image list\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
+    path = write(tmp_path / "images.txt", head, "1 1 0 0 0 1 2 3 1 a.jpg", "")
+    with pytest.raises(
+        DatasetError, match="COLMAP's list of images: its poses are T_camera_world, and in no"
+    ):
+        read_trajectory(path)
 
 
 @pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import row_of, write_image
+from datasets_recordings import row_of, stamped_line, write_image
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose, look_at
@@ -62,6 +62,21 @@ def test_an_assumed_scale_is_replaced_by_the_one_that_fits(tmp_path: Path, steps
     found = steps != (1000.0 if layout == "log" else 5000.0)
     assert ("found by comparing neighbouring frames" in note) == found
     assert ("neighbouring frames differ by 0." in note) == (not found)
+
+
+def test_a_scale_of_the_format_gives_way_to_the_poses(tmp_path: Path) -> None:
+    """As of recorders that write the layout of TUM RGB-D with millimetres."""
+    written, folder = open_dataset(write_room(tmp_path / "mine", 1000.0)), tmp_path / "tum"
+    (folder / "depth").mkdir(parents=True)
+    lines = []
+    for i in range(len(written)):
+        image = np.rint(1000 * written.read(i).depth_m).astype(np.uint16)
+        write_image(folder / f"depth/{i / 10:.6f}.png", image)
+        lines.append(stamped_line(i / 10, written.pose(i)))
+    (folder / "groundtruth.txt").write_text("\n".join(lines))
+    dataset = open_dataset(folder, camera=written.camera)
+    assert any("found by comparing neighbouring frames" in note for note in dataset.notes)
+    np.testing.assert_allclose(dataset.read(3).depth_m, written.read(3).depth_m, atol=1e-3)
 
 
 def test_a_camera_that_stands_still_does_not_tell(tmp_path: Path) -> None:

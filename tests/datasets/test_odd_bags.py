@@ -284,6 +284,39 @@ def test_where_stamps_stand_still_the_times_of_recording_count(make: Callable[..
     check_poses(dataset)
 
 
+def test_stamps_of_zero_are_noted(make: Callable[..., Path]) -> None:
+    """The poses lie so much later that those of the recorded times are exact."""
+
+    def unstamped(bag: Bag) -> None:
+        zero = bag.header(0.0, FRAME)
+        zero.stamp = bag.message("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+        for i in range(COUNT):
+            fields = {"height": 12, "width": 16, "encoding": "16UC1", "is_bigendian": 0, "step": 32}
+            data = steps(i).view(np.uint8).reshape(-1)
+            bag.send(TOPIC, "sensor_msgs/msg/Image", stamp(i), header=zero, data=data, **fields)
+            bag.odometry("/odom", stamp(i) + bag.latency, "odom", BODY, world_body(i))
+
+    def calibrated(bag: Bag) -> None:
+        bag.camera_info(TOPIC.rpartition("/")[0] + "/camera_info", FRAME, CAMERA)
+
+    dataset = open_dataset(make(calibrated, unstamped, mounted))
+    check_poses(dataset)
+    assert any(
+        note.startswith(f"the stamps of {TOPIC} are 0: the times of recording") for note in dataset.notes
+    )
+
+
+def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Callable[..., Path]) -> None:
+    def once(bag: Bag) -> None:
+        bag.tf("/tf", stamp(2), "map", "odom", np.eye(4))
+        for i in range(COUNT):
+            bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
+
+    check_poses(open_dataset(make(images, mounted, once)))
+    mounted_once = make(images, once, lambda bag: bag.tf("/tf", stamp(1), BODY, FRAME, T_body_camera))
+    check_poses(open_dataset(mounted_once))
+
+
 T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
 

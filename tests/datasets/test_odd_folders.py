@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from datasets_recordings import (
+    CAMERA,
     Content,
     row_of,
     stamped_line,
+    text_of,
     write_image,
     write_npz,
     write_numbered,
@@ -174,9 +176,31 @@ def test_the_only_recording_in_a_folder_is_opened(tmp_path: Path) -> None:
     assert dataset.notes[0] == f"the recording is {tmp_path / 'walk' / 'walk'}"
 
 
+def test_a_trajectory_and_intrinsics_of_open3d_are_found(tmp_path: Path) -> None:
+    """Where its reconstruction system writes them; the matrix may be written by rows, as by hand."""
+    write_numbered(tmp_path, CONTENT, place="depth")
+    (tmp_path / "camera.txt").unlink()
+    (tmp_path / "scene").mkdir()
+    lines = [f"{i} {i} {i + 1}\n{text_of(T)}" for i, T in enumerate(CONTENT.poses)]
+    (tmp_path / "scene/trajectory.log").write_text("\n".join(lines))
+    K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    for matrix in (K.T, K):
+        numbers = {"width": 16, "height": 12, "intrinsic_matrix": matrix.reshape(-1).tolist()}
+        (tmp_path / "intrinsic.json").write_text(json.dumps(numbers))
+        dataset = open_dataset(tmp_path)
+        assert dataset.camera == CAMERA
+        np.testing.assert_allclose([dataset.pose(i) for i in range(CONTENT.count)], CONTENT.poses, atol=1e-6)
+
+
 def jsons(folder: Path) -> None:
     for i in range(CONTENT.count):
         (folder / f"frame_{i:05d}.json").write_text(json.dumps({"cameraPoseARFrame": [1.0] * 16}))
+
+
+def npy(folder: Path) -> None:
+    shutil.move(folder / "depth", folder / "rgb")
+    (folder / "depth").mkdir()
+    np.save(folder / "depth/0.npy", CONTENT.depth[0] / 1000)
 
 
 REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -186,6 +210,19 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "JSON": (jsons, "5 files such as frame_00000.json may hold.*--poses-are opengl"),
     "nerfstudio": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json.*--poses-are opengl"),
+    "depth as npy": (npy, "format that is not read .0.npy"),
+    "raw KITTI": (
+        lambda f: (shutil.rmtree(f / "depth"), (f / "oxts").mkdir()),
+        "raw recording of KITTI's, whose oxts/ holds latitudes",
+    ),
+    "angles": (
+        lambda f: (f / "groundtruth.csv").write_text("1,2,3,4,.1,.2,.3"),
+        "no quaternion; angles are not read; --poses FILE",
+    ),
+    "rtabmap-export": (
+        lambda f: shutil.move(f / "depth", f / "rtabmap_depth"),
+        "what rtabmap-export has written; pass the database itself",
+    ),
     "broken poses": (
         lambda f: (f / "poses.txt").write_text("1 2 3 4 5"),
         "without a trajectory.*line 1: 5 numbers",

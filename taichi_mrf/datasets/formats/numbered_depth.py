@@ -1,7 +1,8 @@
 """ICL-NUIM, Redwood and their like: numbered depth PNGs and one file with the trajectory.
 
 The images lie in the folder itself or in ``depth/`` (colour in ``rgb/``, ``color/`` or ``image/``). The
-trajectory's layout decides the defaults:
+trajectory may be ``scene/trajectory.log``, where Open3D's reconstruction system writes it; its layout decides
+the defaults:
 
 - stamped (``*.freiburg``; Handa et al., ICRA 2014): the stamp is the image's number; ICL-NUIM's camera, 5000
   steps a metre. ICL-NUIM's world and camera have y up and are left-handed (its fy is -480); both are
@@ -15,7 +16,6 @@ A camera file in the folder or the caller's options replace all of these. An ass
 against the poses (depth_scale.py), and the notes name what was assumed.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,7 +26,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import NUMBERED_FILES, NUMBERED_IMAGE, numbered_images
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
-from taichi_mrf.datasets.hints import image_hint, pose_files_hint
+from taichi_mrf.datasets.hints import image_hint, pose_files_hint, unread_poses
 from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera, own_cameras
 from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
@@ -49,6 +49,7 @@ from taichi_mrf.system.files import is_file
 NAME = "ICL-NUIM / Redwood"
 ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
 FRAMES_PER_SECOND = 30.0
+OPEN3D_LOG = "scene/trajectory.log"
 COLOR_FOLDERS = ("rgb", "color", "image")
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -105,7 +106,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
         for path in sorted(folder.iterdir())
         if (path.suffix in suffixes and path.name not in CAMERA_FILES and is_trajectory(path))
         or (path.suffix == ".json" and is_trajectory_json(path))
-    ]
+    ] or [path for path in (folder / OPEN3D_LOG,) if is_file(path)]
     if not candidates and may_lack and any(map(holds_depth, images[:2])):
         return None
     if len(candidates) != 1 and (hint := pose_files_hint(folder, images)):
@@ -114,8 +115,8 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
         raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
         raise DatasetError(
-            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}; "
-            f"{OTHERWISE}"
+            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}"
+            f"{unread_poses(folder)}; {OTHERWISE}"
         )
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
@@ -125,22 +126,6 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
     if candidates[0].suffix == ".json":
         return read_trajectory_json(candidates[0])
     return read_trajectory(candidates[0])
-
-
-def _unread(folder: Path) -> str:
-    """Problem of a text file whose name says that it holds poses, in words."""
-    if is_file(folder / "transforms.json"):
-        return (
-            ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "
-            "into poses.txt, and pass --poses-are opengl and --camera fl_x,fl_y,cx,cy"
-        )
-    for path in sorted(folder.glob("*.txt")):
-        if re.search("pose|traj|groundtruth", path.name, re.IGNORECASE):
-            try:
-                read_trajectory(path)
-            except DatasetError as error:
-                return f". {error}"
-    return ""
 
 
 def _poses_by_number(

@@ -51,6 +51,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         rows=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
         steps_per_metre=options.depth_scale or steps,
         scale_source=ASKED if options.depth_scale else str(parameters or NAME),
+        scale_stated=parameters is not None,
         color=options.color,
     )
 

@@ -18,6 +18,7 @@ from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.entries import CLOUD_PLACES
+from taichi_mrf.datasets.hints import unread_poses
 from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd_header
 from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, of_sensor
@@ -73,6 +74,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
         raise DatasetError(
             f"{path}: no poses for its {len(clouds)} scans; add {POSES_NPZ} or a file of poses, or name one: "
             "?poses=FILE. Points in the world's frame need the sensor's poses too: rays begin there"
+            f"{unread_poses(path) if is_folder(path) else ''}"
         )
     posed = [cloud for cloud in clouds if cloud in found]
     world = chosen.points == WORLD

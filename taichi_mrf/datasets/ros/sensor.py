@@ -4,8 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
@@ -52,6 +54,8 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
     if len(recorded) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in recorded}) < len(recorded):
         recorded = [replace(entry, stamp=entry.recorded_ns / 1e9) for entry in recorded]
         notes.append(f"the stamps of {topic} stand still: the times of recording are taken")
+    elif recorded[0].stamp == recorded[0].recorded_ns / 1e9 and _is_unstamped(reader.first(topic)):
+        notes.append(f"the stamps of {topic} are 0: the times of recording are taken, which are later")
     run, entries, said = run_of(reader, topic, recorded, choice.run, what)
     frame = choice.optical or entries[0].frame
     return BagSensor(
@@ -64,6 +68,10 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
         cache(lambda: _tree(reader, topic, frame, choice.tf, run)),
         notes + said,
     )
+
+
+def _is_unstamped(message: Any) -> bool:
+    return header_ns(message.header) == 0
 
 
 def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:

@@ -137,12 +137,25 @@ class TransformTree:
         return of_a[: of_a.index(common)], of_b[: of_b.index(common)]
 
     def _holds(self, frame: str) -> Pose | None:
-        """T_parent_frame if it is the same at all times: fixed, or sent again and again without a change."""
+        """T_parent_frame if it is the same at all times: fixed, or sent again and again without a change, or
+        once where it is another frame that moves."""
         if frame not in self._held:
             edge = self.edges[frame][1]
-            still = edge.poses[0] if isinstance(edge, TimedPoses) and edge.stands_still else None
-            self._held[frame] = still if isinstance(edge, TimedPoses) else edge
+            if isinstance(edge, TimedPoses):
+                still = edge.stands_still or (len(edge) == 1 and self._moves_beside(frame))
+                self._held[frame] = edge.poses[0] if still else None
+            else:
+                self._held[frame] = edge
         return self._held[frame]
+
+    def _moves_beside(self, frame: str) -> bool:
+        """True if a frame above or below this one moves in its parent."""
+        moving = [
+            other
+            for other, (_, edge) in self.edges.items()
+            if isinstance(edge, TimedPoses) and len(edge) > 1 and not edge.stands_still
+        ]
+        return any(frame in self.ancestors(other) or other in self.ancestors(frame) for other in moving)
 
     def _chain(self, frames: list[str], stamp: float, largest_gap: float) -> Pose | None:
         T = np.eye(4)
