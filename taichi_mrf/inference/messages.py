@@ -82,6 +82,22 @@ def count_observations(
     return result
 
 
+def messages_at(
+    slot: int,
+    voxel: int,
+    keyframes: Iterable[tuple[int, VisibleBricks, "ti.Ndarray"]],
+    pool: BrickPool,
+) -> dict[int, float]:
+    """Messages of keyframes, given as their ids, lists of bricks and messages, to one voxel of the brick in a
+    slot of the pool, by id. Those that send none are left out."""
+    found = {}
+    for id, visible, messages in keyframes:
+        here = (visible.slots == slot) & (visible.identity == pool.identity[slot])
+        for place in np.flatnonzero(here).tolist():
+            found[id] = float(messages[place * VOXELS + voxel])
+    return {id: message for id, message in found.items() if message != 0}
+
+
 @ti.kernel
 def _count_messages(
     places: I32Array, rows: I32Array, messages: AnyArray, counts: I32Array, strip: Template

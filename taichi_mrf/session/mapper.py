@@ -334,6 +334,14 @@ class Mapper:
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.posed_image, entries)
 
+    def votes_at(self, point: tuple[float, float, float]) -> messages.Votes:
+        """What the keyframes that are on say of the voxel at a point."""
+        if not has_messages(self.map) or self.lacks_messages:
+            return messages.Votes(point, (), known=False)
+        said, entries = self.map.votes_at(point), self.roster.with_state("on")
+        votes = [(e.id, said[e.map_id]) for e in entries if e.map_id is not None and e.map_id in said]
+        return messages.Votes(point, tuple(sorted(votes, key=lambda vote: -abs(vote[1]))))
+
     def _frozen(self, entry: LiveKeyframe, crossed: NDArray[np.int32]) -> messages.KeyframeInfo:
         """Note that the map has frozen a keyframe; returns the last message about it."""
         picture, entry.picture = entry.picture, FORGOTTEN

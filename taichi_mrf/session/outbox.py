@@ -32,6 +32,7 @@ from taichi_mrf.viewer.messages import (
     SurfaceView,
     TimeSpan,
     Update,
+    Votes,
 )
 from taichi_mrf.voxels.layout import grid_keys
 
@@ -41,7 +42,7 @@ BRICKS_AT_ONCE = 2048
 MOST = {Notice: 50, File: 4}
 """Most updates of these kinds that wait; the oldest are dropped first."""
 
-LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, TimeSpan, SceneChanges, SurfaceView)
+LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, Votes, TimeSpan, SceneChanges, SurfaceView)
 
 MERGE_FACTOR = 2
 """Waiting bricks are merged when their number has grown by this factor since the last merge, so that each is

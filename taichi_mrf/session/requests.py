@@ -119,6 +119,7 @@ class Requests:
             wanted = mapper.posed_image(entry) if entry.state != "frozen" else None
         others = mapper.posed_images_near(np.asarray(request.point, np.float64))
         self._run.send(point_answer(mapper.map, request.point, request.eye, wanted, others))
+        self._run.send(mapper.votes_at(request.point))
 
     def _pixel_ray(self, request: PixelRay) -> None:
         mapper = self._run.mapper

@@ -254,6 +254,17 @@ class RayAnswer(Update):
 
 
 @dataclass(frozen=True)
+class Votes(Update):
+    """What keyframes say of the voxel at a point (metres, world), the strongest first: the number of each,
+    and the log-odds that it adds, above 0 for occupied. ``known`` is False if the map does not keep it, or
+    not yet."""
+
+    point: tuple[float, float, float]
+    votes: tuple[tuple[int, float], ...]
+    known: bool = True
+
+
+@dataclass(frozen=True)
 class Images(Update):
     """Images of one view, (h, w, 3) uint8 each; ``score`` is the sentence that goes with them."""
 

@@ -9,7 +9,7 @@ from live_scene import CONFIG, FakeLink, finished, map_voxels, room, session_of,
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.viewer.messages import Images, PixelRay, RayAnswer, RayThrough, Switch, Watch
+from taichi_mrf.viewer.messages import Images, PixelRay, RayAnswer, RayThrough, Switch, Votes, Watch
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -60,6 +60,29 @@ def test_a_ray_through_a_point_is_that_of_a_keyframe_that_sees_it() -> None:
     assert nearest.measured_m is not None
     assert from_eye.measured_m is None
     assert from_eye.origin == eye
+
+
+def test_what_keyframes_say_of_a_voxel_adds_up_to_its_log_odds() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    m = finished(session)
+    points, _ = m.voxels(0.5)
+    for point in points[:: len(points) // 5]:
+        link.ask(RayThrough(tuple(point.tolist()), (0.0, 0.0, 1.0), None))
+        finished(session)
+        answer = link.of_type(Votes)[-1]
+        assert answer.known
+        assert answer.point == tuple(point)
+        strengths = [abs(log_odds) for _, log_odds in answer.votes]
+        assert strengths == sorted(strengths, reverse=True)
+        p = m.occupancy([point])[0]
+        total = m.view.pool.prior_log_odds + sum(log_odds for _, log_odds in answer.votes)
+        assert total == pytest.approx(np.log(p / (1 - p)), abs=0.02)  # messages are float16
+    strongest = answer.votes[0][0]
+    link.ask(Switch(strongest, False))
+    link.ask(RayThrough(answer.point, (0.0, 0.0, 1.0), None))
+    finished(session)
+    assert strongest not in dict(link.of_type(Votes)[-1].votes)
 
 
 def test_images_of_a_view_are_small_and_scored() -> None:

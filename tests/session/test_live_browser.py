@@ -12,7 +12,7 @@ import pytest
 from browser import LivePage, Seen, chromium, missing
 from live_program import LiveProgram
 
-from taichi_mrf import MRFMap
+from taichi_mrf import OCCUPIED, MRFMap
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
@@ -226,11 +226,39 @@ def wait_for_the_plot(page: LivePage) -> str:
     return page.text()
 
 
-def test_a_click_on_a_voxel_fills_the_plot(page: LivePage) -> None:
+def place_of(text: str) -> tuple[float, ...]:
+    """Coordinates of the voxel that the page answers about."""
+    numbers = re.search(r"x, y, z \(m\)\s+(\S+), (\S+), (\S+)", text)
+    assert numbers is not None
+    return tuple(map(float, numbers.groups()))
+
+
+def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage, saved: MRFMap) -> None:
     nearest = sorted(page.places("/voxels/", "points"), key=lambda place: place[2])
     x, y, _ = page.free_places(nearest[:20])[0]
     page.click(x, y)
     page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
+    answer = (
+        page.until(lambda seen: "alone each would say" in page.text(), "the answer beside it") and page.text()
+    )
+    first = place_of(answer)
+    assert saved.decided.state([first]) == [OCCUPIED]
+    said = float(re.search(r"probability\s+(\S+)", answer).group(1))
+    assert abs(said - saved.decided.occupancy([first])[0]) < 0.002
+    votes = page.page.get_by_role(
+        "button", name=re.compile(r"^Switch off room-000\d: (occupied|free), \d+%$")
+    )
+    assert votes.count() >= 1
+    other = max(page.free_places(nearest[20:400:20]), key=lambda place: np.hypot(place[0] - x, place[1] - y))
+    page.click(*other[:2])
+    page.until(lambda seen: "/distance" in seen.nodes and place_of(page.text()) != first, "the other voxel")
+    apart_m = float(re.search(r"from the last click\s+(\S+) m", page.text()).group(1))
+    assert abs(apart_m - np.linalg.norm(np.subtract(place_of(page.text()), first))) < 0.02  # both are rounded
+    page.screenshot("voxel_answer")
+    page.press("Close")
+    page.until(
+        lambda seen: "/distance" not in seen.nodes and "from the last click" not in page.text(), "no answer"
+    )
     text = wait_for_the_plot(page)
     assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
 

@@ -243,7 +243,7 @@ def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> No
     drawn.take(patch())
     drawn.take(VIEW)
     drawn.draw(show="surface")
-    drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0)))
+    drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0), (0.0, 0.0)))
     asked = drawn.asked[-1]
     assert isinstance(asked, m.RayThrough)
     assert asked.point == pytest.approx((3.0, -3.0, 2.0))

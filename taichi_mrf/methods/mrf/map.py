@@ -19,7 +19,7 @@ from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeCon
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.inference.messages import count_observations
+from taichi_mrf.inference.messages import count_observations, messages_at
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven
@@ -29,12 +29,14 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.protocol import MapStatistics
+from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.survey import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.system import tensors
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -319,6 +321,17 @@ class MRFMap(BrickMap):
         frozen ones count as one; 255 means 255 or more."""
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, sent, self._pool)
+
+    def votes_at(self, point: ArrayLike) -> dict[int, float]:
+        """What each keyframe says of the voxel at a point (3,) in metres, by id: the log-odds that it adds
+        to those of the others, above 0 for occupied. Keyframes that say nothing are left out, and frozen
+        ones."""
+        cell = np.floor(checked_points(np.reshape(point, (1, 3)))[0] / self.voxel_size).astype(np.int64)
+        slots = self._pool.in_use
+        here = slots[(self._pool.bricks[slots] == cell // BRICK).all(axis=1)]
+        voxel = int(np.ravel_multi_index(cell % BRICK, (BRICK,) * 3))
+        sent = [(id, k.visible, k.messages) for id, k in self._keyframes.items() if k.messages is not None]
+        return messages_at(int(here[0]), voxel, sent, self._pool) if len(here) else {}
 
     @property
     def last_voxel_steps(self) -> int:

@@ -1,6 +1,6 @@
 """The live page: what updates and events do to its scene and its widgets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 import viser
@@ -8,6 +8,7 @@ import viser
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.answer import Closed, Point, SwitchOff, VoxelAnswer, beside, facts_of
 from taichi_mrf.viewer.live.panel import (
     CHOSEN_KEYFRAME,
     POSITION_STEP_M,
@@ -26,6 +27,9 @@ from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.transport.process import Inbox
 
+Edit = m.Switch | m.Move
+"""Edits of a keyframe that can be taken back."""
+
 _PLAIN = ViewOptions(show="voxels")
 """Options that the mapping process serves unless it is asked for more."""
 
@@ -37,8 +41,13 @@ class Page(BasePage[Panel]):
         """``ask`` sends a request to the mapping process and does not wait."""
         inbox = Inbox()
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
-        self._voxel_size = 0.0
+        self._hello: m.Hello
+        self._eye: Point = (0.0, 0.0, 0.0)  # from where the voxel of the answer was clicked
+        self.answer = VoxelAnswer(server.scene, server.gui, inbox)
         self._in_photo = False  # whether the page has opened in the colours of photographs
+        self._edits: list[tuple[Edit, Edit]] = []
+        """Edits that can be taken back and made again: what undoes each, and itself."""
+        self._done = 0  # how many of them are made
         self._to_freeze: dict[int, int] = {}  # the keyframe that each client is asked about
         self.handlers |= {
             m.Hello: self._begin,
@@ -50,6 +59,9 @@ class Page(BasePage[Panel]):
             m.CurrentCamera: self._take_camera,
             m.Status: self._take_status,
             m.RayAnswer: self._show_ray,
+            m.Votes: self._show_votes,
+            SwitchOff: self._switch_off,
+            Closed: lambda closed: self.answer.clear(),
             m.Images: self.panel.show_images,
             m.TimeSpan: self.panel.time.show_span,
             m.SceneChanges: self.panel.time.show_changes,
@@ -68,6 +80,8 @@ class Page(BasePage[Panel]):
             Action.FOLLOW: lambda client: self.panel.set_following(),
             Action.RESET: self._reset,
             Action.RESET_CONFIRMED: self._reset_confirmed,
+            Action.UNDO: lambda client: self._undo(),
+            Action.REDO: lambda client: self._redo(),
             Action.CANCELLED: self.panel.close_question,
             Action.CHOOSE_KEYFRAME: lambda client: self._choose(self.panel.chosen_keyframe()),
             Action.SWITCH: lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
@@ -86,7 +100,7 @@ class Page(BasePage[Panel]):
             Action.SAVE_PAGE: lambda client: self.downloads.page(client, self.options.dark),
             Action.RECORD: self._record,
         }
-        server.scene.on_click()(lambda event: inbox.put(Clicked(event.ray_origin, event.ray_direction)))
+        server.scene.on_click()(lambda event: inbox.put(_click_of(event)))
 
     def options_changed(self, before: ViewOptions) -> None:
         """Tell the mapping process which extras are shown, and follow the camera if asked."""
@@ -105,7 +119,9 @@ class Page(BasePage[Panel]):
     def _begin(self, hello: m.Hello) -> None:
         """Start with an empty map."""
         self.begin_map(hello)
-        self._voxel_size, self._in_photo = hello.voxel_size, False
+        self._hello, self._in_photo = hello, False
+        self.answer.clear()
+        self._forget_edits(self.keyframes.keyframes)
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
@@ -138,6 +154,8 @@ class Page(BasePage[Panel]):
             self.panel.color_by_photo()
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
+        if keyframe.state == "frozen":
+            self._forget_edits({keyframe.id})
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
@@ -189,7 +207,42 @@ class Page(BasePage[Panel]):
         """Send a request about the chosen keyframe, unless it is frozen or there is none."""
         chosen = self._changeable()
         if chosen is not None:
-            self.ask(request_for(chosen))
+            request = request_for(chosen)
+            self._make(request) if isinstance(request, Edit) else self.ask(request)
+
+    def _make(self, edit: Edit) -> None:
+        """Send an edit that can be taken back."""
+        before = self.keyframes.keyframes[edit.keyframe]
+        if isinstance(edit, m.Switch):
+            back: Edit = m.Switch(edit.keyframe, before.state == "on")
+        else:
+            back = m.Move(edit.keyframe, before.T_world_camera)
+        self._edits[self._done :] = [(back, edit)]
+        self._done += 1
+        self._show_history()
+        self.ask(edit)
+
+    def _undo(self) -> None:
+        if self._done > 0:
+            self._done -= 1
+            self._show_history()
+            self.ask(self._edits[self._done][0])
+
+    def _redo(self) -> None:
+        if self._done < len(self._edits):
+            self._done += 1
+            self._show_history()
+            self.ask(self._edits[self._done - 1][1])
+
+    def _forget_edits(self, keyframes: Collection[int]) -> None:
+        """Edits of these keyframes can no longer be taken back."""
+        kept = [edit[1].keyframe not in keyframes for edit in self._edits]
+        self._done = sum(kept[: self._done])
+        self._edits = [edit for edit, keep in zip(self._edits, kept, strict=True) if keep]
+        self._show_history()
+
+    def _show_history(self) -> None:
+        self.panel.show_history(self._done > 0, self._done < len(self._edits))
 
     def _changeable(self) -> m.KeyframeInfo | None:
         """The chosen keyframe; None, with a notice that says why, if it cannot be changed."""
@@ -233,7 +286,7 @@ class Page(BasePage[Panel]):
         gizmo, keyframe = self.keyframes.gizmo, self.keyframes.chosen
         if gizmo is not None and keyframe is not None and not dragged.holding:
             place = Placement(np.array(gizmo.wxyz), np.array(gizmo.position))
-            self.ask(m.Move(keyframe, place.pose()))
+            self._make(m.Move(keyframe, place.pose()))
 
     def _choose(self, keyframe: int | None) -> None:
         if keyframe == self.keyframes.chosen:
@@ -261,7 +314,7 @@ class Page(BasePage[Panel]):
             return
         shown = [k for k in self.keyframes.keyframes.values() if k.state != "frozen"]
         pixel = first_pixel(click.origin, click.direction, shown)
-        voxel = first_voxel(click.origin, click.direction, self.map.points(), self._voxel_size)
+        voxel = first_voxel(click.origin, click.direction, self.map.points(), self._hello.voxel_size)
         if pixel is not None and (voxel is None or pixel.range_m < voxel[1]):
             self._choose(pixel.keyframe)
             if pixel.point is None:
@@ -270,8 +323,24 @@ class Page(BasePage[Panel]):
                 x, y, z = pixel.point.tolist()
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
-            point, chosen = voxel[0], self.keyframes.chosen
-            self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
+            x, y, z = voxel[0].tolist()
+            self.answer.move((x, y, z), click.place)
+            self.answer.show(facts_of(voxel[0], self.map.store, self._hello))
+            self._eye = click.origin
+            self.ask(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen))
+
+    def _show_votes(self, answer: m.Votes) -> None:
+        if self.map is not None and answer.point == self.answer.point:
+            known = self.keyframes.keyframes
+            votes = [(known[id], log_odds) for id, log_odds in answer.votes if id in known]
+            facts = facts_of(np.array(answer.point), self.map.store, self._hello)
+            self.answer.show(facts, votes, answer.known)
+
+    def _switch_off(self, switch: SwitchOff) -> None:
+        """Switch a keyframe off, and show what the others say of the voxel."""
+        self._make(m.Switch(switch.keyframe, False))
+        if self.answer.point is not None:
+            self.ask(m.RayThrough(self.answer.point, self._eye, self.keyframes.chosen))
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
         """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
@@ -279,3 +348,9 @@ class Page(BasePage[Panel]):
         by, surface = options.color_by, options.show == "surface"
         instead = surface and self.map is not None and not self.map.growing
         return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface
+
+
+def _click_of(event: viser.SceneClickEvent) -> Clicked:
+    (x, y), camera = event.screen_pos, event.client.camera
+    place = beside(x * camera.image_width, y * camera.image_height, camera.image_width, camera.image_height)
+    return Clicked(event.ray_origin, event.ray_direction, place)

@@ -45,6 +45,8 @@ class Action(Enum):
     FREEZE = auto()
     FREEZE_CONFIRMED = auto()
     CANCELLED = auto()
+    UNDO = auto()
+    REDO = auto()
     TOGGLE_GIZMO = auto()
     PUT_BACK = auto()
     SET_POSITION = auto()
@@ -61,10 +63,12 @@ class Action(Enum):
 
 @dataclass(frozen=True)
 class Clicked(Event):
-    """A click into the scene: the ray from the viewpoint, in the world frame, metres."""
+    """A click into the scene: the ray from the viewpoint, in the world frame, metres; and the ``place`` in
+    the window, pixels from its upper left corner."""
 
     origin: tuple[float, float, float]
     direction: tuple[float, float, float]
+    place: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -80,14 +84,17 @@ RUN_BUTTONS = {
 VIEW_BUTTONS = {
     "Top": Action.TOP, "Front": Action.FRONT, "Side": Action.SIDE, "Fit": Action.FIT,
 }  # fmt: skip
+HISTORY_BUTTONS = {"Undo": Action.UNDO, "Redo": Action.REDO}
 COMMANDS = {
-    "Look from the top": (Action.TOP, "1"),
-    "Look from the front": (Action.FRONT, "2"),
-    "Look from the side": (Action.SIDE, "3"),
-    "Fit the whole map into the window": (Action.FIT, "0"),
-    "Follow the camera, or stop following": (Action.FOLLOW, "F"),
+    "Look from the top": (Action.TOP, "1", None),
+    "Look from the front": (Action.FRONT, "2", None),
+    "Look from the side": (Action.SIDE, "3", None),
+    "Fit the whole map into the window": (Action.FIT, "0", None),
+    "Follow the camera, or stop following": (Action.FOLLOW, "F", None),
+    "Undo the last edit": (Action.UNDO, "Z", "cmd/ctrl"),
+    "Redo the edit": (Action.REDO, "Z", "cmd/ctrl+shift"),
 }
-"""Entries of the command palette: action and key."""
+"""Entries of the command palette: action, key, and the key that is held with it."""
 EDIT_BUTTONS = {
     "On/off": Action.SWITCH,
     "Freeze": Action.FREEZE,
@@ -172,8 +179,11 @@ class Panel(BasePanel):
         self.add_buttons("View", VIEW_BUTTONS, "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.")
         self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
         self._options.add("follow")
-        for label, (action, key) in COMMANDS.items():
-            self.add_command(label, action, key)
+        for label, command in COMMANDS.items():
+            self.add_command(label, *command)
+        hint = "Ctrl-Z takes the last edit back, Ctrl-Shift-Z makes it again; a frozen keyframe stays."
+        self._history: Any = self.add_buttons("Edits", HISTORY_BUTTONS, hint)
+        self.show_history(False, False)
         self.time = TimeFolder(gui, self)
         with self.time.folder:
             self._options.add("dynamic")
@@ -222,6 +232,14 @@ class Panel(BasePanel):
         self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
         self._options.handles["follow"].visible = has_frames
+
+    def show_history(self, can_undo: bool, can_redo: bool) -> None:
+        """Offer to take edits back, and to make them again, if there are any."""
+        offered = (can_undo, can_redo)
+        names = tuple(name for name, can in zip(HISTORY_BUTTONS, offered, strict=True) if can)
+        self._history.visible = bool(names)
+        if names and tuple(self._history.options) != names:
+            self._history.options = names
 
     def set_following(self, on: bool | None = None) -> None:
         """Set the box that follows the camera; None turns it over."""

@@ -134,6 +134,17 @@ class Chunk:
         numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
         return np.where(rows == _NOWHERE, 0, self.seen[rows, numbers]).astype(np.uint8)
 
+    def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
+        """The log-odds of a voxel with coordinates (3,), 0 to 63, and the colour that cameras saw, None if it
+        has none; None if it is not here."""
+        row = self._row[np.ravel_multi_index(tuple(cell // BRICK), (CHUNK,) * 3)]
+        if row == _NOWHERE:
+            return None
+        number = np.ravel_multi_index(tuple(cell % BRICK), (BRICK,) * 3)
+        color = None if self.colors is None else self.colors[row, number]
+        seen = color is not None and (color != NO_COLOR).any()
+        return int(self.log_odds[row, number]), color if seen else None
+
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
         rows = np.flatnonzero(self.bricks[:, axis] == cell // BRICK)
@@ -171,6 +182,12 @@ class VoxelStore:
             changed.add(key)
         self._forget_bounds(changed)
         return changed
+
+    def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
+        """The voxel (3,) of the map, as :meth:`.Chunk.voxel` has it."""
+        x, y, z = (cell // CHUNK_VOXELS).tolist()
+        chunk = self.chunks.get((x, y, z))
+        return None if chunk is None else chunk.voxel(cell % CHUNK_VOXELS)
 
     def remove(self, bricks: NDArray[np.int32]) -> set[ChunkKey]:
         """Remove bricks (n, 3); returns the chunks that have changed. A chunk without bricks is removed."""

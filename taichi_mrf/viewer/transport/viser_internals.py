@@ -166,7 +166,7 @@ def can_be_used(widget: Widget) -> bool:
             return True
         if not container.visible:
             return False
-        if isinstance(container, viser.Gui3dContainerHandle):
+        if isinstance(container, viser.Gui3dContainerHandle | viser.PanelHandle):
             return True
         uuid = container._impl.parent_container_id
     return True
