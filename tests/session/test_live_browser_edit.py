@@ -3,6 +3,7 @@
 What an edit must lead to is computed here from the saved map: the same edit, and full inference.
 """
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,6 +146,24 @@ def test_a_keyframe_is_taken_out_and_comes_back(page: LivePage, edited: MRFMap) 
     page.press("On/off")
     until_same(page, before, "the same map with it at last")
     assert not page.page.get_by_role("button", name="Redo", exact=True).is_visible()
+
+
+def test_a_keyframe_is_switched_off_where_it_says_that_a_voxel_is_occupied(
+    page: LivePage, edited: MRFMap
+) -> None:
+    before = at_rest(page)
+    nearest = sorted(page.places("/voxels/", "points"), key=lambda place: place[2])
+    page.click(*page.free_places(nearest[:20])[0][:2])
+    page.until(lambda seen: "alone each would say" in page.text(), "what keyframes say")
+    button = page.page.get_by_role("button", name=re.compile("^Switch off ")).first
+    name = re.search(r"room-\d+", button.inner_text()).group()
+    button.click()
+    edited.remove_keyframe(next(id for id, keyframe in edited.keyframes.items() if keyframe.name == name))
+    until_count(page, settled_count(edited), f"without {name}")
+    assert page.page.get_by_role("button", name=re.compile(f"^Switch off {name}")).count() == 0
+    page.press("Undo")
+    until_same(page, before, "the same map with it again")
+    page.press("Close")
 
 
 def test_a_keyframe_is_moved_by_its_position_and_put_back(

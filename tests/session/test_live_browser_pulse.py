@@ -26,8 +26,13 @@ DISCONNECTED = "disconnected: reload"
 SILENT = "the mapper does not answer"
 DONE = "up to date"
 
-NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket", "Failed to load resource: net::ERR")
-"""Beginnings of what a browser reports while there is no server, as it must."""
+NO_SERVER = (
+    "WebSocket connection to",
+    "Failed to open WebSocket",
+    "Failed to load resource: net::ERR",
+    "Failed to load resource: the server responded with a status of 503",
+)
+"""Beginnings of what a browser reports while there is no server, or one that is starting, as it must."""
 
 WITHOUT_FOCUS = "Document.prototype.hasFocus = () => false;"
 HURRIED = "const later = setTimeout; setTimeout = (call, ms, ...given) => later(call, ms / 5, ...given);"

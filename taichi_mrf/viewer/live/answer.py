@@ -25,9 +25,9 @@ _LINE_COLOR = (255, 255, 255)
 
 @dataclass(frozen=True)
 class SwitchOff(Event):
-    """The button beside what a keyframe says of a voxel was pressed."""
+    """The button beside what a keyframe says of a voxel was pressed, by its place in the list."""
 
-    keyframe: int
+    number: int
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,12 @@ class VoxelAnswer:
             self._text = gui.add_html("")
             self._switches = [self._add_switch(i) for i in range(_MOST_VOTES)]
             gui.add_button("Close", color="gray").on_click(lambda event: inbox.put(Closed()))
-        self._said_by: list[int] = []
+        self.said_by: list[int] = []
+        """The keyframes that are listed."""
 
     def _add_switch(self, number: int) -> viser.GuiButtonHandle:
         button = self._gui.add_button("", visible=False, hint="Remove this keyframe from the map.")
-        button.on_click(lambda event: self._inbox.put(SwitchOff(self._said_by[number])))
+        button.on_click(lambda event: self._inbox.put(SwitchOff(number)))
         return button
 
     def move(self, point: Point, place: tuple[float, float]) -> None:
@@ -84,15 +85,15 @@ class VoxelAnswer:
         self._text.content = (
             f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
         )
-        self._said_by = [keyframe.id for keyframe, _ in votes[:_MOST_VOTES]]
+        self.said_by = [keyframe.id for keyframe, _ in votes[:_MOST_VOTES]]
         for i, button in enumerate(self._switches):
-            button.visible = i < len(self._said_by)
+            button.visible = i < len(self.said_by)
             if button.visible:
                 button.label = f"Switch off {votes[i][0].name}: {in_words(votes[i][1])}"
 
     def clear(self) -> None:
         """Hide the answer, and remove the line from the scene."""
-        self.point, self._apart, self._panel.visible = None, {}, False
+        self.point, self._apart, self.said_by, self._panel.visible = None, {}, [], False
         for name in ("/answer", "/distance"):
             self._scene.remove_by_name(name)
 

@@ -338,8 +338,9 @@ class Page(BasePage[Panel]):
 
     def _switch_off(self, switch: SwitchOff) -> None:
         """Switch a keyframe off, and show what the others say of the voxel."""
-        self._make(m.Switch(switch.keyframe, False))
-        if self.answer.point is not None:
+        listed = self.answer.said_by[switch.number : switch.number + 1]
+        if listed and self.keyframes.keyframes[listed[0]].state == "on" and self.answer.point is not None:
+            self._make(m.Switch(listed[0], False))
             self.ask(m.RayThrough(self.answer.point, self._eye, self.keyframes.chosen))
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
