@@ -288,7 +288,10 @@ def test_a_recording_without_poses_takes_those_of_a_file(tmp_path: Path) -> None
         _fill(bag)
     path = tmp_path / "poses.txt"
     path.write_text("".join(stamped_line(START + 0.1 * i, POSES[i]) + "\n" for i in (0, 1, 3)))
+    with path.open("a") as file:
+        file.write(f"{START + 0.2} nan nan nan 0 0 0 1\n")
     dataset = open_posed(tmp_path / "walk.bag", path, max_time_gap=0.01)
+    assert any("1 of 4 poses" in note and "left out" in note for note in dataset.notes)
     assert list(dataset.frame_names) == ["000000", "000001", "000003"]
     np.testing.assert_allclose(dataset.read(2).T_world_camera, POSES[3], atol=1e-12)
     assert dataset.dropped == 1

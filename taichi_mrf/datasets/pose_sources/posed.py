@@ -18,7 +18,7 @@ from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.timed_poses import check_unit
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import DatasetError, FrameError, collected_warnings
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.frame import Frame
 
@@ -128,10 +128,11 @@ def posed_by(
     if len(names) and dataset.sensor_of(0):
         raise DatasetError(f"{dataset.name}: has several sensors, and {source.name} the poses of one")
     poses = FramePoses(source, names, largest_gap_s, conventions)
-    if isinstance(source, WatchedFile) and not follow:
-        poses.take(source.read_now())
-    else:
-        poses.renew(float("-inf") if follow else float("inf"))
+    with collected_warnings() as warned:
+        if isinstance(source, WatchedFile) and not follow:
+            poses.take(source.read_now())
+        else:
+            poses.renew(float("-inf") if follow else float("inf"))
     kept: Sequence[int] = range(len(names))
     notes = []
     if not follow:
@@ -145,6 +146,7 @@ def posed_by(
             )
         others = len(names) - len(posed)
         notes = [f"poses of {len(posed)} frames from {source.name}"]
+        notes += [str(each.message) for each in warned]
         notes += [] if poses.warning is None else [poses.warning]
         notes += [moved_note(poses.origin_m)] if poses.origin_m is not None and poses.origin_m.any() else []
         if others and has_poses:
