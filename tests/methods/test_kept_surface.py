@@ -101,7 +101,7 @@ def test_it_is_saved_with_the_map(tmp_path: Path) -> None:
     m._parts.kept.share = RayShare(BrickSums(share.distances.bricks, -share.distances.sums), share.votes)
     header = read_contents(tmp_path / "map.npz").header
     write_contents(tmp_path / "bad.npz", contents_of(header, m._parts, []))
-    with pytest.raises(MapFileError, match="what frozen keyframes measured"):
+    with pytest.raises(MapFileError, match="frozen_distance_bricks or _sums are not in order"):
         MRFMap.load(tmp_path / "bad.npz")
 
 
