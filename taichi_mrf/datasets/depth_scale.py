@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.errors import BackendError, DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -109,7 +109,7 @@ def out_of_sight(dataset: Dataset) -> str:
     if step_m < _LONG_STEP_M:  # no frame need be read
         return ""
     for i in frames:
-        with suppress(DatasetError):
+        with suppress(DatasetError, BackendError):  # a built-in scene may be opened before Taichi is started
             depth_m = dataset.read(i).depth_m
             far_m += [float(np.percentile(depth_m[depth_m > 0], 99))] if (depth_m > 0).any() else []
     if not far_m or step_m <= max(far_m):
