@@ -22,7 +22,6 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
-from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.points import checked_points, classify, point_log_odds, probability
 from taichi_mrf.queries.survey import Occlusion
@@ -154,27 +153,21 @@ class BrickMap(Owned):
         removed since; None before it."""
         return self._up
 
-    def add(self: OccupancyMap, frame: Frame) -> int:
+    if TYPE_CHECKING:  # each method has its own
+
+        def add_keyframe(self, *arguments: Any, **keywords: Any) -> int: ...
+
+    def add(self, frame: Frame) -> int:
         """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. What the frame
         states of its measurements counts as the configuration says, and its colours if the map has any. The
         first frame also says where the map's origin lies in the recorded world, if it was moved. Raises what
         ``add_keyframe`` raises, and ConfigError for a frame of another origin."""
-        assert isinstance(self, BrickMap)
-        self._take_origin(frame)
+        config = _at_origin_of(frame, self.config, is_empty=self.up is None)
         color = frame.color if self.METHOD.has_colors else None
         parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
-        return self.add_keyframe(frame.depth_m, *parts, **frame.own_in(self.config).arguments())
-
-    def _take_origin(self, frame: Frame) -> None:
-        origin = self.config.volume.origin
-        if frame.origin_m is None or frame.origin_m == origin:
-            return
-        if self._next_id or any(origin):
-            theirs, own = (" ".join(f"{x:.0f}" for x in place) for place in (frame.origin_m, origin))
-            raise ConfigError(f"frame {frame.name}: its world's origin is {theirs}, the map's is {own}")
-        x, y, z = frame.origin_m
-        volume = dataclasses.replace(self.config.volume, origin=(x, y, z))
-        self.config = dataclasses.replace(self.config, volume=volume)
+        id = self.add_keyframe(frame.depth_m, *parts, **frame.own_in(config).arguments())
+        self.config = config  # not before the frame is in
+        return id
 
     def _stamp(self, stamp_s: Any) -> float:
         """A new keyframe's stamp; the number of keyframes added before if it is None."""
@@ -313,3 +306,16 @@ class BrickMap(Owned):
     def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
         """The voxels as queries take them, with the probabilities that can be trusted most."""
         return self._grid()
+
+
+def _at_origin_of(frame: Frame, config: Config, is_empty: bool) -> Config:
+    """A map's configuration with the origin of a frame that is to be added. Raises ConfigError if the map
+    has another already."""
+    origin = config.volume.origin
+    if frame.origin_m is None or frame.origin_m == origin:
+        return config
+    if not is_empty or any(origin):
+        theirs, own = (" ".join(f"{x:.0f}" for x in place) for place in (frame.origin_m, origin))
+        raise ConfigError(f"frame {frame.name}: its world's origin is {theirs}, the map's is {own}")
+    x, y, z = frame.origin_m
+    return dataclasses.replace(config, volume=dataclasses.replace(config.volume, origin=(x, y, z)))

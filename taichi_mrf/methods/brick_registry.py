@@ -9,9 +9,10 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.inference.keyframe import Footprint, VisibleBricks
+from taichi_mrf.queries.points import checked_points
 from taichi_mrf.voxels.layout import BRICK, CHUNK, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
@@ -54,6 +55,16 @@ class BrickRegistry:
         """Centre the volume on a position (3,) in the world, if its place is not fixed yet."""
         brick = np.floor(position_m / (self.voxel_size * BRICK))
         self.topology.anchor(np.clip(brick, -(2**30), 2**30).astype(np.int32))
+
+    def places_of(self, points: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The slots (N,) of the bricks that hold points (N, 3) in metres, -1 for none, and the numbers (N,)
+        of the voxels in these. Raises ConfigError for points of another shape or that are not finite."""
+        places = np.floor(checked_points(points) / self.voxel_size)
+        voxels = np.clip(places, -(2**30), 2**30).astype(np.int32)
+        bricks = np.ascontiguousarray(voxels // BRICK)
+        slots = self.topology.slots(bricks) if len(bricks) else np.zeros(0, np.int32)
+        local = voxels - bricks * BRICK
+        return slots, (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
 
     def restore(self, bricks: Bricks, owners: NDArray[np.int32] | int) -> NDArray[np.int32]:
         """Allocate the bricks of a saved map, (n, 3) with n > 0, with their numbers of owners; returns their

@@ -15,9 +15,8 @@ from taichi_mrf.inference.color_sums import ColorShare, ColorSums
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_registry import BrickRegistry
-from taichi_mrf.queries.points import checked_points
 from taichi_mrf.system.later import later
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
 if TYPE_CHECKING:
@@ -73,12 +72,7 @@ class MapColors:
     def at(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Colours (N, 4) of the voxels that hold points (N, 3) in metres: red, green, blue, and how much was
         seen; 0 for none."""
-        places = np.floor(checked_points(points) / self._registry.voxel_size)
-        voxels = np.clip(places, -(2**30), 2**30).astype(np.int32)
-        bricks = np.ascontiguousarray(voxels // BRICK)
-        slots = self._registry.topology.slots(bricks) if len(bricks) else np.zeros(0, np.int32)
-        local = voxels - bricks * BRICK
-        numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
+        slots, numbers = self._registry.places_of(points)
         inside, out = slots >= 0, np.zeros((len(slots), 4), np.uint8)
         if inside.any() and self:
             out[inside] = self._found()[slots[inside].astype(np.int64) * VOXELS + numbers[inside]]

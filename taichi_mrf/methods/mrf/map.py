@@ -29,14 +29,12 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.protocol import MapStatistics
-from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.survey import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.system import tensors
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.distance_field import DistanceField
-from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -326,12 +324,11 @@ class MRFMap(BrickMap):
         """What each keyframe says of the voxel at a point (3,) in metres, by id: the log-odds that it adds
         to those of the others, above 0 for occupied. Keyframes that say nothing are left out, and frozen
         ones."""
-        cell = np.floor(checked_points(np.reshape(point, (1, 3)))[0] / self.voxel_size).astype(np.int64)
-        slots = self._pool.in_use
-        here = slots[(self._pool.bricks[slots] == cell // BRICK).all(axis=1)]
-        voxel = int(np.ravel_multi_index(cell % BRICK, (BRICK,) * 3))
+        inferring.restore_messages(self._parts)
+        slots, numbers = self._registry.places_of(np.reshape(point, (1, 3)))
         sent = [(id, k.visible, k.messages) for id, k in self._keyframes.items() if k.messages is not None]
-        return messages_at(int(here[0]), voxel, sent, self._pool) if len(here) else {}
+        slot, voxel = int(slots[0]), int(numbers[0])
+        return messages_at(slot, voxel, sent, self._pool) if slot >= 0 else {}
 
     @property
     def last_voxel_steps(self) -> int:
