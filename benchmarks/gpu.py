@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
 TARGETS_MS = {0.02: 10.0, 0.01: 25.0}
 FULL_TARGET_S, OCTOMAP_TARGET = 3.0, 100.0
 TESTS = (
@@ -128,8 +129,8 @@ def tests(options: Options) -> dict[str, Any]:
 
 def kernels(options: Options) -> dict[str, Any]:
     """Kernel times of a keyframe at each voxel size, by Taichi's profiler."""
-    from taichi_mrf.benchmark.bandwidth import copy_bandwidth
-    from taichi_mrf.benchmark.profile import profile_mapping
+    from benchmarks.speed.bandwidth import copy_bandwidth
+    from benchmarks.speed.profile import profile_mapping
     from taichi_mrf.config.schema import Config
 
     device = _start(options, profile=options.arch != "vulkan")
@@ -152,8 +153,8 @@ def kernels(options: Options) -> dict[str, Any]:
 
 def wall(options: Options) -> dict[str, Any]:
     """Wall time of a keyframe with three sweeps, and of full inference at the finest voxel size."""
+    from benchmarks.speed.profile import count_launches
     from taichi_mrf.benchmark.keyframe_cost import Seconds, live_stages, timed, warm_up
-    from taichi_mrf.benchmark.profile import count_launches
     from taichi_mrf.config.schema import Config
     from taichi_mrf.methods.mrf.map import MRFMap
 

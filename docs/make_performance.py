@@ -17,17 +17,19 @@ KITCHEN = "seven_scenes_redkitchen"
 LAPS = "synthetic:room?frames=480&width=160&height=120"
 
 BENCHES: dict[str, list[str]] = {
-    "performance_stages.png": ["bench", KITCHEN],
-    "performance_kernels.png": ["bench", KITCHEN, "--profile"],
-    "performance_growth.png": ["bench", LAPS, "--frames", "480", "--voxel-sizes", "0.05", "--growth"],
-}
-"""The pictures of ``taichi-mrf bench --plot``, each with its arguments."""
+    "performance_stages.png": ["taichi_mrf", "bench", KITCHEN],
+    "performance_kernels.png": ["benchmarks.speed", KITCHEN, "--measure", "profile"],
+    "performance_growth.png": [
+        "benchmarks.speed", LAPS, "--measure", "growth", "--frames", "480", "--voxel-sizes", "0.05",
+    ],
+}  # fmt: skip
+"""The pictures of ``taichi-mrf bench --plot`` and of benchmarks/speed, each with its module and arguments."""
 
 EVALUATIONS: dict[str, tuple[list[str], str]] = {
-    "performance_rays.png": (["rays"], "rays_curve.png"),
-    "performance_endless.png": (["endless", "--voxel-sizes", "0.1"], "endless_100mm.png"),
+    "performance_rays.png": (["benchmarks.lab", "rays"], "rays_curve.png"),
+    "performance_endless.png": (["benchmarks.lab", "endless", "--voxel-sizes", "0.1"], "endless_100mm.png"),
 }
-"""The pictures of ``taichi-mrf eval``: arguments, and the name that the command gives the picture."""
+"""The pictures of benchmarks/lab: module and arguments, and the name that the command gives the picture."""
 
 
 def main() -> None:
@@ -35,7 +37,7 @@ def main() -> None:
     if len(sys.argv) < 2:
         sys.exit(__doc__)
     known = [*BENCHES, *EVALUATIONS]
-    data, wanted = Path(sys.argv[1]), sys.argv[2:] or known
+    data, wanted = Path(sys.argv[1]).resolve(), sys.argv[2:] or known
     strange = sorted(set(wanted) - set(known))
     if strange:
         sys.exit(f"no such picture: {', '.join(strange)}; there are {', '.join(known)}")
@@ -43,7 +45,7 @@ def main() -> None:
     for name in wanted:
         if name in EVALUATIONS:
             arguments, drawn = EVALUATIONS[name]
-            program("eval", *arguments, "--data", str(data), "--out", str(OUT))
+            program(*arguments, "--data", str(data), "--out", str(OUT))
             shutil.copyfile(OUT / drawn, IMAGES / name)
         else:
             arguments = [str(data / KITCHEN) if each == KITCHEN else each for each in BENCHES[name]]
@@ -52,8 +54,8 @@ def main() -> None:
 
 
 def program(*arguments: str) -> None:
-    """Run taichi-mrf with its output in this terminal."""
-    subprocess.run([sys.executable, "-m", "taichi_mrf", *arguments], check=True)
+    """Run a module with its output in this terminal."""
+    subprocess.run([sys.executable, "-m", *arguments], check=True, cwd=REPOSITORY)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""The work of ``taichi-mrf bench``: read the frames, measure what was asked for, print, write and draw."""
+"""The work of ``taichi-mrf bench``: read the frames, measure, print, write and draw."""
 
 import dataclasses
 import json
-import statistics
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,25 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from taichi_mrf.benchmark.bandwidth import Bandwidth, copy_bandwidth
-from taichi_mrf.benchmark.bench import STEADY_FRAMES, BenchRow, bench_mapping, octomap_available
-from taichi_mrf.benchmark.bench_pictures import draw_growth, draw_profiles, draw_stages, write_figure
-from taichi_mrf.benchmark.growth import Growth, Lap, Line, measure_growth
+from taichi_mrf.benchmark.bench import BenchRow, bench_mapping, octomap_available
+from taichi_mrf.benchmark.bench_pictures import draw_stages, write_figure
 from taichi_mrf.benchmark.keyframe_cost import Seconds
-from taichi_mrf.benchmark.profile import KernelCost, Profile, profile_mapping
-from taichi_mrf.benchmark.queries import (
-    BALLS,
-    BODIES,
-    POINTS,
-    RANGE_M,
-    RAYS,
-    REACH,
-    QueryRow,
-    Rate,
-    bench_queries,
-    missing_peers,
-)
-from taichi_mrf.cli.options.measure import MODES, Bench
+from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
@@ -45,14 +29,8 @@ if TYPE_CHECKING:
 Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None"]
 """Measurements: tables to print, figures to write, and what draws them, if they can be drawn."""
 
-HOST_ROWS = 12
-"""Functions of the host that are listed, at most; the rest is one row."""
 
-_QUERY_NAMES = {"balls": "balls, by clearance", "rays": "rays, to what is occupied"}
-"""Of the rates, those that are called otherwise here."""
-
-
-class _Run:
+class BenchRun:
     """One run of the command: its frames, and the bar that shows how far it is."""
 
     def __init__(self, options: Bench, console: Terminal, progress: ProgressBar) -> None:
@@ -78,66 +56,39 @@ class _Run:
             stage = f"{config.voxel_size:g} m{what}"
             yield config, partial(_advance, self.progress, stage, len(self.frames))
 
-    def stages(self) -> Measured:
-        with_octomap = self.options.octomap and octomap_available()
-        if self.options.octomap and not with_octomap:
-            line = "OctoMap is left out: pip install 'taichi-mrf[bench]' brings it."
-            self.console.print_line(line)
-        rows: list[BenchRow] = []
-        for config, advance in self.each_size():
-            rows.append(bench_mapping(self.frames, config, with_octomap, advance))
-        draw = partial(draw_stages, rows, self.title)
-        return [bench_table(rows, self.title)], [row.to_json() for row in rows], draw
-
-    def profile(self) -> Measured:
-        bandwidth = copy_bandwidth()
-        measured = max(1, min(STEADY_FRAMES, len(self.frames) // 4))
-        rows: list[Profile] = []
-        for config, advance in self.each_size():
-            rate = bandwidth.bytes_per_second
-            rows.append(profile_mapping(self.frames, config, rate, measured, advance))
-        tables = profile_tables(rows, self.title, bandwidth)
-        figures = [row.to_json() | {"bandwidth": bandwidth.how} for row in rows]
-        return tables, figures, partial(draw_profiles, rows, self.title)
-
-    def growth(self) -> Measured:
-        rows: list[Growth] = []
-        for kind in ("unseen", "seen"):
-            for config, advance in self.each_size(f", {kind}"):
-                rows.append(measure_growth(self.frames, config, kind, advance))
-        rows.sort(key=lambda row: -row.voxel_size)
-        draw = partial(draw_growth, rows, self.title)
-        return [growth_table(rows, self.title)], [row.to_json() for row in rows], draw
-
-    def queries(self) -> Measured:
-        for name in missing_peers():
-            line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
-            self.console.print_line(line)
-        rows: list[QueryRow] = []
-        for config, advance in self.each_size():
-            rows.append(bench_queries(self.frames, config, advance))
-        return query_tables(rows, self.title), [row.to_json() for row in rows], None
-
-    def viewer(self) -> Measured:
-        from taichi_mrf.session.bench import bench_viewer  # the page's packages are slow to import
-
-        rows = [bench_viewer(self.frames, config, advance) for config, advance in self.each_size()]
-        figures = [
-            {"voxel_size": config.voxel_size, "keyframes": [dataclasses.asdict(each) for each in row]}
-            for config, row in zip(self.configs, rows, strict=True)
-        ]
-        return [viewer_table(self.options.voxel_sizes, rows, self.title)], figures, None
+    def leave_out(self, peer: str) -> None:
+        """Say that a peer is not installed."""
+        self.console.print_line(f"{peer} is left out: pip install 'taichi-mrf[bench]' brings it.")
 
 
-def run_bench(options: Bench) -> int:
-    """Measure, print, write and draw; always 0. Raises TaichiMRFError."""
+def measure_stages(run: BenchRun) -> Measured:
+    """The stages of a new keyframe, beside OctoMap where that is installed."""
+    with_octomap = run.options.octomap and octomap_available()
+    if run.options.octomap and not with_octomap:
+        run.leave_out("OctoMap")
+    rows: list[BenchRow] = []
+    for config, advance in run.each_size():
+        rows.append(bench_mapping(run.frames, config, with_octomap, advance))
+    draw = partial(draw_stages, rows, run.title)
+    return [bench_table(rows, run.title)], [row.to_json() for row in rows], draw
+
+
+def run_bench(
+    options: Bench,
+    measured: str = "stages",
+    measure: Callable[[BenchRun], Measured] = measure_stages,
+    profile: bool = False,
+) -> int:
+    """Measure, print, write and draw; always 0. With ``profile`` Taichi times each kernel.
+
+    Raises TaichiMRFError.
+    """
     console = open_terminal(options.printing)
     wanted = options.settings.runtime
-    runtime.init(wanted.arch, wanted.threads, profile=options.profile)
+    runtime.init(wanted.arch, wanted.threads, profile=profile)
     with ProgressBar(console, options.printing) as progress:
-        run = _Run(options, console, progress)
-        mode = next((name for name in MODES if getattr(options, name)), "stages")
-        tables, figures, draw = getattr(run, mode)()
+        run = BenchRun(options, console, progress)
+        tables, figures, draw = measure(run)
     for table in tables:
         console.print(table)
     if options.json is not None:
@@ -145,7 +96,7 @@ def run_bench(options: Bench) -> int:
             "device": run.device,
             "compiler": run.compiler,
             "source": options.source,
-            "measured": mode,
+            "measured": measured,
             "rows": figures,
         }
         write_text(options.json, json.dumps(report, indent=2) + "\n")
@@ -156,57 +107,6 @@ def run_bench(options: Bench) -> int:
 
 def _advance(progress: ProgressBar, stage: str, total: int, done: int) -> None:
     progress.advance(stage, done, total)
-
-
-def query_tables(rows: Sequence[QueryRow], title: str) -> list[Table]:
-    """Million queries a second, and the seconds that distances take beside SciPy's transform."""
-    return [_rate_table(rows, title), _distance_table(rows)]
-
-
-def _rate_table(rows: Sequence[QueryRow], title: str) -> Table:
-    sizes = [row.voxel_size for row in rows]
-    table = size_columns(f"Million a second (for each processor's second): {title}", sizes)
-    for name in rows[0].rates:
-        table.add_row(_QUERY_NAMES.get(name, name), *[_rate(row.rates[name]) for row in rows])
-    for name in rows[0].peers:
-        table.add_row(name, *[_rate(row.peers[name]) for row in rows], style="dim")
-    table.caption = (
-        f"{POINTS:,} points, {RAYS:,} rays of up to {RANGE_M:g} m, and {BODIES:,} configurations of {BALLS} "
-        "balls in a call; OctoMap is asked for the states of all points in one call, Open3D's rays meet the "
-        "voxels as cubes."
-    )
-    table.caption_justify = "left"
-    return table
-
-
-def _distance_table(rows: Sequence[QueryRow]) -> Table:
-    table = size_columns(
-        f"Signed distances up to {REACH} voxels, seconds (processors' seconds)",
-        [row.voxel_size for row in rows],
-    )
-
-    def line(name: str, figure: str) -> None:
-        table.add_row(name, *[_seconds(getattr(row, figure)) for row in rows])
-
-    line("of the whole map", "build")
-    line("after one more keyframe", "update")
-    table.add_row("  voxels that it changes", *[f"{row.changed:,}" for row in rows])
-    line("SciPy, the box around the map", "transform")
-    table.add_row("  voxels of the box", *[f"{row.box_voxels:,}" for row in rows])
-    table.add_row("memory of the field, MB", *[f"{row.field_mb:.0f}" for row in rows])
-    return table
-
-
-def _seconds(seconds: Seconds | None) -> str:
-    return "-" if seconds is None else f"{seconds.wall:.3f} ({seconds.cpu:.3f})"
-
-
-def _rate(rate: Rate) -> str:
-    return f"{rate.millions:.2f} ({rate.cpu_millions:.2f})"
-
-
-if TYPE_CHECKING:  # the page's packages are slow to import
-    from taichi_mrf.session.bench import ViewerRow
 
 
 def bench_table(rows: Sequence[BenchRow], title: str) -> Table:
@@ -249,113 +149,6 @@ def bench_table(rows: Sequence[BenchRow], title: str) -> Table:
     line("voxels", lambda r: f"{r.voxels:,}")
     line("bytes a voxel, all keyframes", lambda r: f"{r.bytes_per_voxel:.1f}")
     line("peak memory, MB", lambda r: "-" if r.peak_memory_mb is None else f"{r.peak_memory_mb:.0f}")
-    return table
-
-
-def profile_tables(rows: Sequence[Profile], title: str, bandwidth: Bandwidth) -> list[Table]:
-    """Two tables for each voxel size: kernels beside their floors, and the host's functions."""
-    tables = []
-    memory = f"memory: {bandwidth.bytes_per_second / 1e9:.1f} GB/s, {bandwidth.how}"
-    for row in rows:
-        tables += [_kernel_table(row, title, memory), _host_table(row)]
-    return tables
-
-
-def _kernel_table(row: Profile, title: str, memory: str) -> Table:
-    work = row.work
-    table = Table(title=f"{row.voxel_size * 100:g} cm, kernels: {title}", title_justify="left")
-    for name in ("stage", "kernel"):
-        table.add_column(name, no_wrap=True, overflow="fold")
-    for name in ("calls", "ms", "MB", "floor, ms", "share"):
-        table.add_column(name, justify="right")
-    for kernel in row.kernels:
-        calls = f"{kernel.calls:.1f}"
-        table.add_row(kernel.stage, kernel.name, calls, f"{kernel.seconds * 1e3:.3f}", *_floor(kernel, row))
-    table.caption_justify = "left"
-    table.caption = (
-        "MB: the least to be read and written; floor: what that takes; share: of the time taken. "
-        f"A keyframe, mean of {row.keyframes}: {work.rays:,.0f} rays, {work.crossed:,.0f} bricks crossed, "
-        f"{work.visible:,.0f} visible, {work.voxel_steps:,.0f} voxel steps at "
-        f"{row.step_seconds * 1e9:.1f} ns; {memory}."
-    )
-    return table
-
-
-def _floor(kernel: KernelCost, row: Profile) -> list[str]:
-    if kernel.floor_bytes is None:
-        return ["-", "-", "-"]
-    least = kernel.floor_bytes / row.bytes_per_second
-    share = f"{100 * least / max(kernel.seconds, 1e-9):.1f}%"
-    return [f"{kernel.floor_bytes / 1e6:.2f}", f"{least * 1e3:.3f}", share]
-
-
-def _host_table(row: Profile) -> Table:
-    table = Table(title=f"{row.voxel_size * 100:g} cm, host", title_justify="left")
-    for name in ("stage", "function, with the libraries that it calls"):
-        table.add_column(name)
-    for name in ("calls", "ms"):
-        table.add_column(name, justify="right")
-    shown, rest = row.host[:HOST_ROWS], row.host[HOST_ROWS:]
-    for host in shown:
-        table.add_row(host.stage, host.function, f"{host.calls:.1f}", f"{host.seconds * 1e3:.3f}")
-    table.add_row("", f"{len(rest)} others", "", f"{sum(each.seconds for each in rest) * 1e3:.3f}")
-    for stage, seconds in row.wall.items():
-        in_kernels = sum(k.seconds for k in row.kernels if k.stage == stage)
-        text = (
-            f"all, of which {in_kernels * 1e3:.3f} ms in kernels; {row.waits[stage]:.1f} waits for the device"
-        )
-        table.add_row(stage, text, "", f"{seconds * 1e3:.3f}", style="bold")
-    return table
-
-
-def growth_table(rows: Sequence[Growth], title: str) -> Table:
-    """One row for each voxel size and kind: fitted lines, and their values at a thousand keyframes."""
-    table = Table(title=f"New keyframes beside old ones: {title}", title_justify="left")
-    table.add_column("")
-    table.add_column("old ones")
-    for name in ("alone, ms", "whole (mean), ms", "processors, ms", "memory, MB"):
-        table.add_column(name, justify="right")
-    figures: list[tuple[Callable[[Lap], float], float]] = [
-        (lambda lap: lap.alone.wall, 1e3),
-        (lambda lap: lap.whole.wall, 1e3),
-        (lambda lap: lap.whole.cpu, 1e3),
-        (lambda lap: lap.memory_mb, 1.0),
-    ]
-    for row in rows:
-        texts = [_line(row.line(figure), scale) for figure, scale in figures]
-        table.add_row(f"{row.voxel_size * 100:g} cm", row.kind, *texts)
-    table.caption = (
-        "At no old keyframe + for each old one (± standard error). Alone: without re-inference of others; "
-        "processors: their time for the whole."
-    )
-    table.caption_justify = "left"
-    return table
-
-
-def _line(line: Line, scale: float) -> str:
-    error = "" if line.slope_error is None else f" ± {line.slope_error * scale:.4f}"
-    return f"{line.at_zero * scale:.1f} + {line.slope * scale:.4f}{error}"
-
-
-def viewer_table(voxel_sizes: Sequence[float], benches: "Sequence[Sequence[ViewerRow]]", title: str) -> Table:
-    """Medians over keyframes, and the largest."""
-    table = Table(title=f"Live view: {title}", title_justify="left")
-    table.add_column("a keyframe: median (largest)")
-    for size in voxel_sizes:
-        table.add_column(f"{size * 100:g} cm", justify="right")
-
-    def line(name: str, figure: str, scale: float, digits: int) -> None:
-        texts = []
-        for rows in benches:
-            values = [getattr(row, figure) * scale for row in rows]
-            texts.append(f"{statistics.median(values):,.{digits}f} ({max(values):,.{digits}f})")
-        table.add_row(name, *texts)
-
-    line("find the changes, ms", "publish", 1e3, 1)
-    line("draw them, ms", "draw", 1e3, 1)
-    line("changed bricks", "changed", 1, 0)
-    line("sent to a browser, MB", "sent", 1e-6, 2)
-    table.add_row("voxels shown in the end", *[f"{rows[-1].shown:,}" for rows in benches])
     return table
 
 

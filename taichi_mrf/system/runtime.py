@@ -66,7 +66,7 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
 
     ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
     Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
-    ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (benchmark/profile.py).
+    ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (benchmarks/speed/profile.py).
     Once Taichi runs, "auto" or the same arch change nothing. The calling thread becomes the owner of
     Taichi: maps can be used in no other thread (system/owner.py).
 

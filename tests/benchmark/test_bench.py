@@ -4,34 +4,42 @@ import cProfile
 import importlib
 import json
 import pstats
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_room
-from console import as_process
 
-from taichi_mrf.benchmark import profile
-from taichi_mrf.benchmark.bandwidth import copy_bandwidth
+from benchmarks.speed import profile
+from benchmarks.speed.bandwidth import copy_bandwidth
+from benchmarks.speed.growth import elsewhere, fit_line, measure_growth
+from benchmarks.speed.profile import COPIES, FLOORS, Work, host_seconds
 from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
-from taichi_mrf.benchmark.growth import elsewhere, fit_line, measure_growth
 from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, live_stages
-from taichi_mrf.benchmark.profile import COPIES, FLOORS, Work, host_seconds
 from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
 
 COARSE = Config(voxel_size=small_room.VOXEL_SIZE)
+REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = "synthetic:room?width=64&height=48&frames=8"
 
 
-def bench(*flags: str, out: Path) -> tuple[list[dict], str]:
-    """The rows and the output of the command, as users run it."""
-    command = ["bench", TINY, "--voxel-sizes", "0.1", "--runtime.arch", "cpu", "--json", str(out), *flags]
-    done = as_process(*command)  # which may start Taichi with its profiler
+def bench(*flags: str, out: Path, program: Sequence[str] = ("taichi_mrf", "bench")) -> tuple[list[dict], str]:
+    """The rows and the output of `taichi-mrf bench`, or of benchmarks/speed."""
+    common = [TINY, "--voxel-sizes", "0.1", "--runtime.arch", "cpu", "--json", str(out), *flags]
+    command = [sys.executable, "-m", *program, *common]  # a process, which may start Taichi with its profiler
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return json.loads(out.read_text(encoding="utf-8"))["rows"], done.stdout
+
+
+def speed(measure: str, *flags: str, out: Path) -> tuple[list[dict], str]:
+    return bench("--measure", measure, *flags, out=out, program=["benchmarks.speed"])
 
 
 @pytest.mark.usefixtures("backend")
@@ -71,9 +79,7 @@ def test_targets_are_those_of_the_usual_voxel_sizes() -> None:
     assert all(alone < whole for alone, whole in TARGETS.values())
 
 
-def test_modes_that_do_not_go_together_are_refused() -> None:
-    with pytest.raises(ConfigError, match="--profile and --growth do not go together"):
-        Bench(profile=True, growth=True)
+def test_a_picture_needs_a_known_ending() -> None:
     with pytest.raises(ConfigError, match=r"must end in \.png, \.svg or \.pdf"):
         Bench(plot=Path("stages.jpeg2"))
 
@@ -92,8 +98,8 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
 
 
 def test_every_kernel_with_a_floor_is_found_in_a_profile(tmp_path: Path) -> None:
-    (row,), text = bench(
-        "--frames", "4", "--profile", "--plot", str(tmp_path / "a.svg"), out=tmp_path / "p.json"
+    (row,), text = speed(
+        "profile", "--frames", "4", "--plot", str(tmp_path / "a.svg"), out=tmp_path / "p.json"
     )
     found = {(kernel["stage"], kernel["name"]) for kernel in row["kernels"]}
     wanted = {(stage, name) for stage, floors in FLOORS.items() for name in floors if name not in COPIES}
@@ -210,9 +216,7 @@ def test_a_line_is_fitted_with_its_error() -> None:
 
 
 def test_growth_is_measured_and_drawn_by_the_command(tmp_path: Path) -> None:
-    rows, text = bench(
-        "--frames", "4", "--growth", "--plot", str(tmp_path / "g.png"), out=tmp_path / "g.json"
-    )
+    rows, text = speed("growth", "--frames", "4", "--plot", str(tmp_path / "g.png"), out=tmp_path / "g.json")
     assert [row["kind"] for row in rows] == ["unseen", "seen"]
     assert all(np.isfinite(row["lines"]["whole"]["slope"]) for row in rows)
     assert "unseen" in text

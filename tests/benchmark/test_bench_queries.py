@@ -1,20 +1,18 @@
 """The benchmark of queries asks the same of the same map, and says who is missing."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_room
-from console import as_process
 
+from benchmarks.speed import queries
 from taichi_mrf import ExportOptions, cast_rays, export_map
-from taichi_mrf.benchmark import queries
 from taichi_mrf.benchmark.keyframe_cost import Seconds
-from taichi_mrf.cli.bench import query_tables
-from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
-from taichi_mrf.errors import ConfigError
 
 NAMES = {"occupancy", "state", "distance", "distance and gradient", "balls", "rays"}
 
@@ -35,7 +33,7 @@ def test_all_queries_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(row.peers) == {title for name, title in peers.items() if name not in missing}
     figures = json.loads(json.dumps(row.to_json()))
     assert figures["rates"]["rays"]["millions"] == pytest.approx(row.rates["rays"].millions)
-    assert [table.row_count for table in query_tables([row], "a room")] == [6 + len(row.peers), 6]
+    assert [table.row_count for table in queries.query_tables([row], "a room")] == [6 + len(row.peers), 6]
 
 
 def test_rates_are_counts_by_seconds() -> None:
@@ -43,12 +41,11 @@ def test_rates_are_counts_by_seconds() -> None:
     assert (rate.millions, rate.cpu_millions) == (2.0, 1.0)
 
 
-def test_the_command_says_who_is_missing(tmp_path: Path) -> None:
+def test_the_command_says_who_is_missing(tmp_path: Path, repository: Path) -> None:
     out = tmp_path / "queries.json"
-    source = "synthetic:room?width=64&height=48&frames=3"
-    done = as_process(
-        "bench", source, "--queries", "--voxel-sizes", "0.2", "--runtime.arch", "cpu", "--json", str(out)
-    )
+    command = [sys.executable, "-m", "benchmarks.speed", "synthetic:room?width=64&height=48&frames=3"]
+    command += ["--measure", "queries", "--voxel-sizes", "0.2", "--runtime.arch", "cpu", "--json", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository)
     assert done.returncode == 0, done.stderr
     report = json.loads(out.read_text(encoding="utf-8"))
     assert report["measured"] == "queries"
@@ -57,13 +54,6 @@ def test_the_command_says_who_is_missing(tmp_path: Path) -> None:
     for name in ("OctoMap", "Open3D"):
         line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
         assert (line in done.stdout) == (name in queries.missing_peers())
-
-
-def test_queries_are_not_drawn() -> None:
-    with pytest.raises(ConfigError, match="--plot does not go with --queries"):
-        Bench(queries=True, plot=Path("a.png"))
-    with pytest.raises(ConfigError, match="--profile and --queries do not go together"):
-        Bench(queries=True, profile=True)
 
 
 @pytest.mark.usefixtures("one_backend")

@@ -21,7 +21,7 @@ from one_pixel import (
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.benchmark.profile import count_launches
+from benchmarks.speed.profile import count_launches
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import content_key

@@ -10,8 +10,6 @@ from taichi_mrf.cli.options.shared import Verbosity, check_least
 from taichi_mrf.config.schema import Config, RuntimeConfig
 from taichi_mrf.errors import ConfigError
 
-MODES = ("viewer", "profile", "growth", "queries")
-
 
 @dataclass(frozen=True)
 class Bench:
@@ -33,21 +31,6 @@ class Bench:
     octomap: bool = True
     """Insert the same frames into OctoMap, where the extra 'bench' is installed."""
 
-    profile: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show instead where the time goes: every kernel next to the bound that memory bandwidth sets, and the
-    host's functions."""
-
-    growth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Measure instead how cost and memory grow with the number of earlier keyframes, in view and out of view:
-    eight laps of the frames, at one place and at places 100 m apart."""
-
-    viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Measure instead what each keyframe costs the live view: time on the server and bytes to a browser."""
-
-    queries: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Measure instead how many points, balls and rays a second a planner can ask about, and what distances
-    cost, of the whole map and after one more keyframe, beside OctoMap, SciPy and Open3D."""
-
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write all figures to this file as well."""
 
@@ -62,12 +45,6 @@ class Bench:
 
     def __post_init__(self) -> None:
         check_least(self, frames=1)
-        chosen = [f"--{mode}" for mode in MODES if getattr(self, mode)]
-        if len(chosen) > 1:
-            raise ConfigError(f"{' and '.join(chosen)} do not go together")
-        for mode in ("viewer", "queries"):
-            if self.plot is not None and getattr(self, mode):
-                raise ConfigError(f"--plot does not go with --{mode}")
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")
 

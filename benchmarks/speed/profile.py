@@ -3,7 +3,7 @@ each kernel must read and write.
 
 Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
 so many kernels, launches are timed instead, which has a launch's own cost in it. Profiling slows the host
-down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
+down. `taichi-mrf bench` measures what a keyframe costs; this divides that cost among kernels and host.
 
 The bytes of a kernel, divided by the memory's bandwidth, are a floor under its time: nothing that computes
 the same can be faster, unless its data are still in a cache. Every array is counted once, however often it is
@@ -22,21 +22,38 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.table import Table
 
 import taichi_mrf
+from benchmarks.speed.bandwidth import Bandwidth, copy_bandwidth
 from taichi_mrf import Config, Frame, MRFMap
+from taichi_mrf.benchmark.bench import STEADY_FRAMES
+from taichi_mrf.benchmark.bench_pictures import STAGE_COLORS, STAGE_NAMES, TARGET_COLOR, legend_below
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
+from taichi_mrf.cli.bench import BenchRun, Measured
+from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.inference.sweep import TRACE_BYTES
 from taichi_mrf.kernels import quick_start
 from taichi_mrf.system import compiler, runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Floor = Callable[["Work"], float]
+
+HOST_ROWS = 12
+"""Functions of the host that are listed, at most; the rest is one row."""
+
+KERNELS_DRAWN = 8
+SHORTEST_MS = 0.01
+"""Lower end of the logarithmic scale of kernels."""
 
 
 @dataclass(frozen=True)
@@ -369,3 +386,97 @@ def _summary(
         kernels=sorted(kernel_costs, key=lambda cost: -cost.seconds),
         host=sorted(host_costs, key=lambda cost: -cost.seconds),
     )
+
+
+def measure_profile(run: BenchRun) -> Measured:
+    """Every kernel beside the bound that memory bandwidth sets, and the host's functions."""
+    bandwidth = copy_bandwidth()
+    measured = max(1, min(STEADY_FRAMES, len(run.frames) // 4))
+    rows: list[Profile] = []
+    for config, advance in run.each_size():
+        rows.append(profile_mapping(run.frames, config, bandwidth.bytes_per_second, measured, advance))
+    tables = profile_tables(rows, run.title, bandwidth)
+    figures = [row.to_json() | {"bandwidth": bandwidth.how} for row in rows]
+    return tables, figures, partial(draw_profiles, rows, run.title)
+
+
+def profile_tables(rows: Sequence[Profile], title: str, bandwidth: Bandwidth) -> list[Table]:
+    """Two tables for each voxel size: kernels beside their floors, and the host's functions."""
+    tables = []
+    memory = f"memory: {bandwidth.bytes_per_second / 1e9:.1f} GB/s, {bandwidth.how}"
+    for row in rows:
+        tables += [_kernel_table(row, title, memory), _host_table(row)]
+    return tables
+
+
+def _kernel_table(row: Profile, title: str, memory: str) -> Table:
+    work = row.work
+    table = Table(title=f"{row.voxel_size * 100:g} cm, kernels: {title}", title_justify="left")
+    for name in ("stage", "kernel"):
+        table.add_column(name, no_wrap=True, overflow="fold")
+    for name in ("calls", "ms", "MB", "floor, ms", "share"):
+        table.add_column(name, justify="right")
+    for kernel in row.kernels:
+        calls = f"{kernel.calls:.1f}"
+        table.add_row(kernel.stage, kernel.name, calls, f"{kernel.seconds * 1e3:.3f}", *_floor(kernel, row))
+    table.caption_justify = "left"
+    table.caption = (
+        "MB: the least to be read and written; floor: what that takes; share: of the time taken. "
+        f"A keyframe, mean of {row.keyframes}: {work.rays:,.0f} rays, {work.crossed:,.0f} bricks crossed, "
+        f"{work.visible:,.0f} visible, {work.voxel_steps:,.0f} voxel steps at "
+        f"{row.step_seconds * 1e9:.1f} ns; {memory}."
+    )
+    return table
+
+
+def _floor(kernel: KernelCost, row: Profile) -> list[str]:
+    if kernel.floor_bytes is None:
+        return ["-", "-", "-"]
+    least = kernel.floor_bytes / row.bytes_per_second
+    share = f"{100 * least / max(kernel.seconds, 1e-9):.1f}%"
+    return [f"{kernel.floor_bytes / 1e6:.2f}", f"{least * 1e3:.3f}", share]
+
+
+def _host_table(row: Profile) -> Table:
+    table = Table(title=f"{row.voxel_size * 100:g} cm, host", title_justify="left")
+    for name in ("stage", "function, with the libraries that it calls"):
+        table.add_column(name)
+    for name in ("calls", "ms"):
+        table.add_column(name, justify="right")
+    shown, rest = row.host[:HOST_ROWS], row.host[HOST_ROWS:]
+    for host in shown:
+        table.add_row(host.stage, host.function, f"{host.calls:.1f}", f"{host.seconds * 1e3:.3f}")
+    table.add_row("", f"{len(rest)} others", "", f"{sum(each.seconds for each in rest) * 1e3:.3f}")
+    for stage, seconds in row.wall.items():
+        in_kernels = sum(k.seconds for k in row.kernels if k.stage == stage)
+        text = (
+            f"all, of which {in_kernels * 1e3:.3f} ms in kernels; {row.waits[stage]:.1f} waits for the device"
+        )
+        table.add_row(stage, text, "", f"{seconds * 1e3:.3f}", style="bold")
+    return table
+
+
+def draw_profiles(rows: Sequence[Profile], title: str) -> "Figure":
+    """The most expensive kernels at each voxel size, and the floors under them, on a logarithmic scale."""
+    figure = new_figure(4.4 * len(rows) + 1.0, 4.2)
+    figure.suptitle(f"Kernels of a new keyframe: {title}", fontsize=9, wrap=True)
+    panels = figure.subplots(1, len(rows), squeeze=False)[0]
+    for axes, row in zip(panels, rows, strict=True):
+        shown = row.kernels[:KERNELS_DRAWN][::-1]
+        place = np.arange(len(shown))
+        taken = [kernel.seconds * 1e3 for kernel in shown]
+        floors = [(kernel.floor_bytes or 0.0) / row.bytes_per_second * 1e3 for kernel in shown]
+        for stage in row.wall:
+            width = [ms if kernel.stage == stage else 0.0 for ms, kernel in zip(taken, shown, strict=True)]
+            axes.barh(place, width, 0.75, color=STAGE_COLORS[stage], label=STAGE_NAMES[stage])
+        axes.barh(place, floors, 0.35, color=TARGET_COLOR, label="least that its bytes could take")
+        axes.set_yticks(place, [kernel.name for kernel in shown])
+        axes.set(
+            xscale="log",
+            xlim=(SHORTEST_MS, 2 * max(taken)),
+            xlabel="ms a keyframe, logarithmic",
+            title=f"{row.voxel_size * 100:g} cm",
+        )
+        axes.spines[["top", "right"]].set_visible(False)
+    legend_below(figure, panels)
+    return figure

@@ -5,16 +5,19 @@ those that went over the wire.
 """
 
 import asyncio
+import statistics
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import viser
 import websockets
+from rich.table import Table
 from websockets.asyncio.client import connect
 from websockets.typing import Origin, Subprotocol
 
+from taichi_mrf.cli.bench import BenchRun, Measured
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.geometry.up import up_of
@@ -142,3 +145,36 @@ class _Reader:
             async for message in connection:
                 self.received += len(message)
                 self._last = time.monotonic()
+
+
+def measure_viewer(run: BenchRun) -> Measured:
+    """What each keyframe costs the live view: time on the server and bytes to a browser."""
+    rows = [bench_viewer(run.frames, config, advance) for config, advance in run.each_size()]
+    sizes = run.options.voxel_sizes
+    figures = [
+        {"voxel_size": size, "keyframes": [asdict(each) for each in row]}
+        for size, row in zip(sizes, rows, strict=True)
+    ]
+    return [viewer_table(sizes, rows, run.title)], figures, None
+
+
+def viewer_table(voxel_sizes: Sequence[float], benches: Sequence[Sequence[ViewerRow]], title: str) -> Table:
+    """Medians over keyframes, and the largest."""
+    table = Table(title=f"Live view: {title}", title_justify="left")
+    table.add_column("a keyframe: median (largest)")
+    for size in voxel_sizes:
+        table.add_column(f"{size * 100:g} cm", justify="right")
+
+    def line(name: str, figure: str, scale: float, digits: int) -> None:
+        texts = []
+        for rows in benches:
+            values = [getattr(row, figure) * scale for row in rows]
+            texts.append(f"{statistics.median(values):,.{digits}f} ({max(values):,.{digits}f})")
+        table.add_row(name, *texts)
+
+    line("find the changes, ms", "publish", 1e3, 1)
+    line("draw them, ms", "draw", 1e3, 1)
+    line("changed bricks", "changed", 1, 0)
+    line("sent to a browser, MB", "sent", 1e-6, 2)
+    table.add_row("voxels shown in the end", *[f"{rows[-1].shown:,}" for rows in benches])
+    return table

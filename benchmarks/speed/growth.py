@@ -7,12 +7,20 @@ at one place, and it sees them. Straight lines are fitted to both.
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from rich.table import Table
 
 from taichi_mrf import Config, Frame, MRFMap
 from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, warm_up
+from taichi_mrf.cli.bench import BenchRun, Measured
+from taichi_mrf.evaluation.pictures.figures import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LAPS = 8
 
@@ -20,6 +28,9 @@ PLACES_APART_M = 100.0
 """Distance of the places, which lie on a grid of 3 x 3: voxels of 1 cm span 655 m."""
 
 Kind = Literal["unseen", "seen"]
+
+KIND_COLORS = {"unseen": "#4477aa", "seen": "#ee6677"}
+KIND_NAMES = {"unseen": "old keyframes that it does not see", "seen": "old keyframes that it sees"}
 
 
 @dataclass(frozen=True)
@@ -128,3 +139,73 @@ def elsewhere(frame: Frame, place: int) -> Frame:
     T_world_camera = frame.T_world_camera.copy()
     T_world_camera[:2, 3] += PLACES_APART_M * (np.array(divmod(place, 3)) - 1.0)
     return replace(frame, T_world_camera=T_world_camera)
+
+
+def measure_laps(run: BenchRun) -> Measured:
+    """Cost and memory against the number of earlier keyframes, in view and out of view."""
+    rows: list[Growth] = []
+    kinds: tuple[Kind, Kind] = ("unseen", "seen")
+    for kind in kinds:
+        for config, advance in run.each_size(f", {kind}"):
+            rows.append(measure_growth(run.frames, config, kind, advance))
+    rows.sort(key=lambda row: -row.voxel_size)
+    draw = partial(draw_growth, rows, run.title)
+    return [growth_table(rows, run.title)], [row.to_json() for row in rows], draw
+
+
+def growth_table(rows: Sequence[Growth], title: str) -> Table:
+    """One row for each voxel size and kind: fitted lines, and their values at a thousand keyframes."""
+    table = Table(title=f"New keyframes beside old ones: {title}", title_justify="left")
+    table.add_column("")
+    table.add_column("old ones")
+    for name in ("alone, ms", "whole (mean), ms", "processors, ms", "memory, MB"):
+        table.add_column(name, justify="right")
+    figures: list[tuple[Callable[[Lap], float], float]] = [
+        (lambda lap: lap.alone.wall, 1e3),
+        (lambda lap: lap.whole.wall, 1e3),
+        (lambda lap: lap.whole.cpu, 1e3),
+        (lambda lap: lap.memory_mb, 1.0),
+    ]
+    for row in rows:
+        texts = [_line(row.line(figure), scale) for figure, scale in figures]
+        table.add_row(f"{row.voxel_size * 100:g} cm", row.kind, *texts)
+    table.caption = (
+        "At no old keyframe + for each old one (± standard error). Alone: without re-inference of others; "
+        "processors: their time for the whole."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _line(line: Line, scale: float) -> str:
+    error = "" if line.slope_error is None else f" ± {line.slope_error * scale:.4f}"
+    return f"{line.at_zero * scale:.1f} + {line.slope * scale:.4f}{error}"
+
+
+def draw_growth(rows: Sequence[Growth], title: str) -> "Figure":
+    """Cost and memory against the number of old keyframes, seen and unseen, with straight lines fitted."""
+    sizes = sorted({row.voxel_size for row in rows}, reverse=True)
+    figure = new_figure(4.4 * len(sizes) + 0.6, 7.4)
+    figure.suptitle(f"A new keyframe in a growing map: {title}", fontsize=9, wrap=True)
+    panels = figure.subplots(2, len(sizes), squeeze=False)
+    for column, size in enumerate(sizes):
+        for row in (row for row in rows if row.voxel_size == size):
+            _draw_line(panels[0, column], row, lambda lap: lap.whole.wall * 1e3, "ms")
+            _draw_line(panels[1, column], row, lambda lap: lap.memory_mb, "MB")
+        panels[0, column].set(title=f"{size * 100:g} cm", ylabel="whole cost of a new keyframe, ms")
+        panels[1, column].set(ylabel="memory of the map, MB", xlabel="old keyframes")
+    for axes in panels.flat:
+        axes.set_ylim(bottom=0.0)
+        axes.legend(fontsize=7, loc="best")
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _draw_line(axes: "Axes", row: Growth, figure: Callable[[Lap], float], unit: str) -> None:
+    color, old = KIND_COLORS[row.kind], [lap.old for lap in row.laps]
+    line = row.line(figure)
+    error = "" if line.slope_error is None else f" ± {line.slope_error:.2g}"
+    label = f"{KIND_NAMES[row.kind]}: {line.slope:+.2g}{error} {unit} each"
+    axes.plot(old, [figure(lap) for lap in row.laps], "o", color=color, markersize=4.0)
+    ends = [old[0], old[-1]]
+    axes.plot(ends, [line.at(x) for x in ends], color=color, label=label)

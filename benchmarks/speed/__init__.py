@@ -1,0 +1,1 @@
+"""How fast, in detail: `python -m benchmarks.speed SOURCE --measure NAME`, from the root of the project."""
