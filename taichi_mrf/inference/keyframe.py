@@ -155,40 +155,64 @@ def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class RayList(Bundle):
-    """The rays of a depth image, tile after tile. Kernels take it as it is."""
+    """The rays of a depth image, group after group, tile after tile. Kernels take it as it is. n and g are at
+    least 1."""
 
     blocks: I32Array
-    """(n): which block of pixels each ray stands for (ray_list.block_of); n is at least 1."""
+    """(n): which block of pixels each ray stands for (ray_list.block_of)."""
 
     depth: F32Array
     """(n): each ray's measurement, the mean of its pixels, in metres."""
 
+    last: F32Array
+    """(n): the depth at which each ray ends, because its measurement carries no more evidence."""
+
     number: I32
     """Number of entries that are rays."""
 
+    groups: I32Array
+    """(g): which block of pixels each group stands for."""
+
+    first: I32Array
+    """(g + 1): the first ray of each group; the next group's first is its end."""
+
+    support: F32Array
+    """(g): the depth before which no ray of the group can have met its surface."""
+
+    group_number: I32
+    """Number of entries that are groups."""
+
     widest: I32
-    """Largest number of pixels along a block's side."""
+    """Largest number of pixels along a group's side."""
+
+    @staticmethod
+    def empty(rays: int, groups: int) -> "RayList":
+        """A list with room for so many."""
+        n, g = max(1, rays), max(1, groups)
+        blocks, group_blocks, first = (ti.ndarray(ti.i32, size) for size in (n, g, g + 1))
+        depth, last, support = (ti.ndarray(ti.f32, size) for size in (n, n, g))
+        return RayList(blocks, depth, last, rays, group_blocks, first, support, groups, 1)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the list."""
-        return 8 * self.blocks.shape[0]
+        return 12 * (self.blocks.shape[0] + self.groups.shape[0])
 
 
 @dataclass
 class NoReturnRays:
     """The rays of the pixels that got no return. The depth of their ``image`` is that up to which they count,
-    and ``entry_depths`` (rays) that from which on they do (sensor/no_return.py)."""
+    ``reach_m``, and ``begin_m`` that from which on they do (sensor/no_return.py)."""
 
     image: DepthImage
     ray_list: RayList
-    entry_depths: ti.Ndarray
+    begin_m: float
     reach_m: float
 
     @property
     def nbytes(self) -> int:
         """Bytes of the image and of the list of the rays."""
-        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
+        return self.image.nbytes + self.ray_list.nbytes
 
 
 @dataclass(frozen=True)
@@ -244,11 +268,10 @@ class Keyframe:
     """One keyframe of a map.
 
     ``stamp_s`` is when it was taken, in seconds. ``messages`` is (bricks * 512) log-odds, in the order of
-    ``visible``. ``entry_depths`` is, for each ray of
-    the list, the depth up to which it crosses none of these bricks, once it is known. ``revision`` is that of
-    the beliefs right after its last sweep, and ``change_count_at_last_sweep`` (bricks) how often marginals of
-    each brick had changed by then. ``pending_visible`` is what the keyframe sees now, if its messages are
-    still those of ``visible``. ``no_returns`` are the rays of pixels that got no return, if they count.
+    ``visible``. ``revision`` is that of the beliefs right after its last sweep, and
+    ``change_count_at_last_sweep`` (bricks) how often marginals of each brick had changed by then.
+    ``pending_visible`` is what the keyframe sees now, if its messages are still those of ``visible``.
+    ``no_returns`` are the rays of pixels that got no return, if they count.
     """
 
     id: int
@@ -259,8 +282,6 @@ class Keyframe:
     stamp_s: float
     footprint: Footprint
     visible: VisibleBricks
-    entry_depths: ti.Ndarray
-    entry_depths_known: bool = False
     revision: int = -1
     messages: ti.Ndarray | None = None
     change_count_at_last_sweep: NDArray[np.int64] | None = None
@@ -297,7 +318,7 @@ class Keyframe:
     def image_bytes(self) -> int:
         """Bytes of the images and of the lists of the rays."""
         no_returns = 0 if self.no_returns is None else self.no_returns.nbytes
-        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4 + no_returns
+        return self.image.nbytes + self.ray_list.nbytes + no_returns
 
     @property
     def voxel_bytes(self) -> int:

@@ -30,9 +30,7 @@ def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler)
     depth = np.where(image.own.no_return, np.float32(law.reach_m), np.float32(0.0))
     without = DepthImage.upload(depth, image.camera, law)
     rays = bundler.rays_of(without)
-    entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
-    entry_depths.fill(law.begin_m)
-    return NoReturnRays(without, rays, entry_depths, law.reach_m)
+    return NoReturnRays(without, rays, law.begin_m, law.reach_m)
 
 
 def send_no_returns(
@@ -46,7 +44,7 @@ def send_no_returns(
     """
     sums.fill(0)
     sum_product.send_messages(
-        no_returns.ray_list, no_returns.entry_depths, 1, no_returns.image.sensor, view, space,
+        no_returns.ray_list, no_returns.begin_m, no_returns.image.sensor, view, space,
         replace(model, max_depth=no_returns.reach_m, floor=0.0),
         replace(swept, sums=sums),
         trace, workers,

@@ -5,21 +5,26 @@ pixels are therefore merged, two of a size at a time, as long as enough rays sti
 and their measurements agree, and their sigmas where each pixel has its own. The ray through a block's middle
 has their mean depth, and their number as its weight. Pixels that do not agree, such as those at the edge of a
 surface, keep rays of their own.
+
+In front of all surfaces rays side by side tell voxels the same, that they are free, and there one for each
+voxel is enough. Rays therefore form groups, larger blocks of pixels, which have one way in common up to where
+the first of their rays may meet its surface.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
+from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.traversal import pixel_ray
+from taichi_mrf.voxels.traversal import FAR, pixel_ray
 
 LEVELS = 10
 """A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each
@@ -31,6 +36,9 @@ BITS = 4
 AGREE_VOXELS = 0.5
 AGREE_SIGMAS = 2.0
 """Measurements agree if they differ by no more than either of these."""
+
+FREE_RAYS = 1.0
+"""Ways in common that meet a voxel facing the camera, at least."""
 
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many."""
@@ -44,6 +52,20 @@ def block_of(ray: I32, width: I32):
 
 
 @ti.func
+def block_ray(block: I32, sensor: Template, view: Template):
+    """The ray through the middle of a block of pixels."""
+    u, v, wide, high = block_of(block, sensor.camera.width)
+    return pixel_ray(sensor, view, u + 0.5 * (wide - 1), v + 0.5 * (high - 1))
+
+
+@ti.func
+def block_noise(block: I32, sensor: Template):
+    """The noise in the middle of a block of pixels."""
+    u, v, wide, high = block_of(block, sensor.camera.width)
+    return sensor.noise_at(u + wide // 2, v + high // 2)
+
+
+@ti.func
 def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how
     many pixels the block has."""
@@ -52,13 +74,15 @@ def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     return ray, sensor.noise_at(u + wide // 2, v + high // 2), wide * high
 
 
-def stride_metres(camera: Camera, voxel_size: float, ray_density: float) -> float:
-    """Distance between rays, in pixels, times the depth in metres: a voxel at depth z covers
-    voxel_size * pixels_per_radian / z pixels along each side. 0 casts every pixel."""
-    if ray_density == 0:
-        return 0.0
-    rays_per_voxel = max(1.0, ray_density * 100.0 * voxel_size)
-    return voxel_size * camera.pixels_per_radian / math.sqrt(rays_per_voxel)
+def rays_per_voxel(voxel_size: float, ray_density: float) -> float:
+    """Rays that meet a voxel facing the camera, at least; infinite where every pixel casts one."""
+    return max(1.0, ray_density * 100.0 * voxel_size) if ray_density > 0 else math.inf
+
+
+def stride_metres(camera: Camera, voxel_size: float, per_voxel: float) -> float:
+    """Distance between so many rays for each voxel, in pixels, times the depth in metres: a voxel at depth z
+    covers voxel_size * pixels_per_radian / z pixels along each side."""
+    return voxel_size * camera.pixels_per_radian / math.sqrt(per_voxel)
 
 
 class RayBundler:
@@ -70,35 +94,45 @@ class RayBundler:
         self._farthest = ti.ndarray(ti.f32, 1)
         self._mean = ti.ndarray(ti.f32, 1)
         self._level = ti.ndarray(ti.i32, 1)
+        self._group = ti.ndarray(ti.i32, 1)
 
     def rays_of(self, image: DepthImage) -> RayList:
         """The rays that an image casts, wherever it was taken."""
         camera = image.camera
         self._reserve(camera.width * camera.height)
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-        stride = stride_metres(camera, self.voxel_size, self.inference.ray_density)
-        counts, widest = np.zeros(tiles, np.int32), np.ones(tiles, np.int32)
-        rule = _MergeRule(stride, AGREE_VOXELS * self.voxel_size, AGREE_SIGMAS)
-        blocks_of_pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level)
-        _choose(image.depth, image.sensor, rule, blocks_of_pixels, counts)
-        number = int(counts.sum())
-        blocks, depth = ti.ndarray(ti.i32, max(1, number)), ti.ndarray(ti.f32, max(1, number))
-        first = np.cumsum(counts, dtype=np.int32) - counts
-        _write_down(camera.width, camera.height, self._mean, self._level, first, blocks, depth, widest)
-        return RayList(blocks, depth, number, int(widest.max()))
+        per_voxel = rays_per_voxel(self.voxel_size, self.inference.ray_density)
+        free_per_voxel = math.inf if math.isinf(per_voxel) else min(per_voxel, FREE_RAYS)
+        rule = _MergeRule(
+            stride_metres(camera, self.voxel_size, per_voxel),
+            stride_metres(camera, self.voxel_size, free_per_voxel),
+            AGREE_VOXELS * self.voxel_size,
+            AGREE_SIGMAS,
+        )
+        counts, groups, widest = (np.zeros(tiles, np.int32) for _ in range(3))
+        pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level, self._group)
+        _choose(image.depth, image.sensor, rule, pixels, counts, groups)
+        rays = RayList.empty(int(counts.sum()), int(groups.sum()))
+        first, first_group = (np.cumsum(each, dtype=np.int32) - each for each in (counts, groups))
+        _write_down(camera.width, camera.height, pixels, first, first_group, rays, widest)
+        _find_reach(rays, image.sensor, END_SIGMAS)
+        return replace(rays, widest=int(widest.max()))
 
     def _reserve(self, pixels: int) -> None:
         if pixels > self._level.shape[0]:
             self._nearest, self._farthest, self._mean = (ti.ndarray(ti.f32, pixels) for _ in range(3))
-            self._level = ti.ndarray(ti.i32, pixels)
+            self._level, self._group = (ti.ndarray(ti.i32, pixels) for _ in range(2))
 
 
 @dataclass(frozen=True)
 class _MergeRule(Bundle):
-    """The conditions under which a block of pixels becomes one ray."""
+    """The conditions under which a block of pixels becomes one ray, or a group of rays."""
 
     stride_metres: F32
     """See :func:`stride_metres`."""
+
+    free_stride_metres: F32
+    """The same of groups."""
 
     agree_m: F32
     """Measurements in metres agree if they differ by no more than this,"""
@@ -112,7 +146,7 @@ class _PixelBlocks(Bundle):
     """The blocks that begin at each pixel, row by row. All arrays (H * W)."""
 
     nearest: F32Array
-    """The smallest measurement in the block, metres."""
+    """The smallest measurement in the block, or in the group, metres; FAR without one."""
 
     farthest: F32Array
     """The largest one."""
@@ -123,10 +157,14 @@ class _PixelBlocks(Bundle):
     level: I32Array
     """The block's level, -1 where none begins."""
 
+    group: I32Array
+    """The level of the group that begins here, which holds whole blocks, -1 where none begins."""
+
 
 @ti.func
 def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n: I32):
-    """Make one block of level ``n`` at pixel (u, v) of the two below it, if they are there and agree."""
+    """Make one block of level ``n`` at pixel (u, v) of the two below it, if they are there and agree, and one
+    group of two groups. Groups need not agree: a ray that goes further than others does so by itself."""
     wide, high = 1 << (n + 1) // 2, 1 << n // 2
     a = v * sensor.camera.width + u
     b = a + (wide // 2 if n % 2 == 1 else high // 2 * sensor.camera.width)
@@ -148,15 +186,28 @@ def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n
                 blocks.mean[a] = 0.5 * (blocks.mean[a] + blocks.mean[b])
                 blocks.level[a] = n
                 blocks.level[b] = -1
+    if blocks.group[a] == n - 1 and blocks.group[b] == n - 1:
+        near = ti.min(blocks.nearest[a], blocks.nearest[b])
+        if near >= FAR or wide * high * near * near <= rule.free_stride_metres * rule.free_stride_metres:
+            blocks.nearest[a] = near
+            blocks.group[a] = n
+            blocks.group[b] = -1
 
 
 @kernel
 def _choose(
-    depth: F32Array, sensor: Sensor, rule: _MergeRule, blocks: _PixelBlocks, counts: I32Array
+    depth: F32Array,
+    sensor: Sensor,
+    rule: _MergeRule,
+    blocks: _PixelBlocks,
+    counts: I32Array,
+    groups: I32Array,
 ) -> None:
-    """Give each pixel the level of the block that begins there, or -1 if none does; count them by tile.
+    """Give each pixel the levels of the block and the group that begin there, or -1 if none does; count them
+    by tile.
 
-    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` (tiles) receives the number of rays.
+    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` and ``groups`` (tiles) receive the numbers
+    of rays and of groups with rays.
     """
     width = sensor.camera.width
     height = depth.shape[0] // width
@@ -170,10 +221,11 @@ def _choose(
                 for u in range(left, right):
                     i = v * width + u
                     measured = depth[i]
-                    blocks.nearest[i] = measured
+                    blocks.nearest[i] = measured if measured > 0.0 else FAR
                     blocks.farthest[i] = measured
                     blocks.mean[i] = measured
                     blocks.level[i] = 0 if measured > 0.0 else -1
+                    blocks.group[i] = 0
             for n in range(1, LEVELS + 1):
                 wide, high = 1 << (n + 1) // 2, 1 << n // 2
                 for block in range(TILE * TILE >> n):
@@ -181,36 +233,63 @@ def _choose(
                     v = top + block // (TILE // wide) * high
                     if u + wide <= right and v + high <= bottom:
                         _merge(rule, blocks, sensor, u, v, n)
-            rays = 0
+            rays, grouped = 0, 0
             for v in range(top, bottom):
                 for u in range(left, right):
-                    rays += ti.cast(blocks.level[v * width + u] >= 0, ti.i32)
+                    i = v * width + u
+                    rays += ti.cast(blocks.level[i] >= 0, ti.i32)
+                    grouped += ti.cast(_has_rays(blocks, i), ti.i32)
             counts[tile] = rays
+            groups[tile] = grouped
 
 
-@ti.kernel
+@ti.func
+def _has_rays(blocks: Template, i: I32):
+    """True if a group with rays begins at pixel i."""
+    return blocks.group[i] >= 0 and blocks.nearest[i] < FAR
+
+
+@kernel
 def _write_down(
-    width: I32, height: I32, mean: F32Array, level: I32Array, first: I32Array,
-    blocks: I32Array, depth: F32Array, widest: I32Array,
-):  # fmt: skip
-    """List the blocks that begin in each tile, from its place ``first`` (tiles) in the list on.
-
-    ``mean`` (H * W) metres and ``level`` (H * W) are those of _PixelBlocks, ``blocks`` and ``depth`` (rays)
-    those of the list. ``widest`` (tiles) receives the largest side of a block in pixels.
+    width: I32, height: I32, blocks: _PixelBlocks, first: I32Array, first_group: I32Array,
+    rays: RayList, widest: I32Array,
+) -> None:  # fmt: skip
+    """List the groups that begin in each tile, and their rays, from its places ``first_group`` and ``first``
+    (tiles) in the lists on. ``widest`` (tiles) receives the largest side of a group in pixels.
     """
     across = (width + TILE - 1) // TILE
     for iteration in range(first.shape[0] * SPREAD):
         if iteration % SPREAD == 0:
             tile = iteration // SPREAD
             left, top = tile % across * TILE, tile // across * TILE
-            ray = first[tile]
-            highest = 0
+            ray, group, highest = first[tile], first_group[tile], 0
             for v in range(top, ti.min(top + TILE, height)):
                 for u in range(left, ti.min(left + TILE, width)):
-                    i = v * width + u
-                    if level[i] >= 0:
-                        blocks[ray] = (i << BITS) + level[i]
-                        depth[ray] = mean[i]
-                        highest = ti.max(highest, level[i])
-                        ray += 1
+                    corner = v * width + u
+                    if _has_rays(blocks, corner):
+                        level = blocks.group[corner]
+                        wide = 1 << (level + 1) // 2
+                        rays.groups[group] = (corner << BITS) + level
+                        rays.first[group] = ray
+                        for k in range(1 << level):
+                            i = corner + k // wide * width + k % wide
+                            if blocks.level[i] >= 0:
+                                rays.blocks[ray] = (i << BITS) + blocks.level[i]
+                                rays.depth[ray] = blocks.mean[i]
+                                ray += 1
+                        highest = ti.max(highest, level)
+                        group += 1
+                        rays.first[group] = ray  # the last one's end; others are written again
             widest[tile] = 1 << (highest + 1) // 2
+
+
+@kernel
+def _find_reach(rays: RayList, sensor: Sensor, end_sigmas: F32) -> None:
+    """The depths at which rays end, and those before which none of a group can meet its surface."""
+    for group in range(rays.group_number):
+        before = FAR
+        for i in range(rays.first[group], rays.first[group + 1]):
+            noise = block_noise(rays.blocks[i], sensor)
+            rays.last[i] = sensor.farthest_depth(rays.depth[i], noise, end_sigmas)
+            before = ti.min(before, sensor.support(rays.depth[i], noise))
+        rays.support[group] = before

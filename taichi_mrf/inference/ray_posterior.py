@@ -131,15 +131,11 @@ class RayVisitor(Bundle):
 
 @kernel
 def follow_rays(
-    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
-    sensor: Sensor, view: Viewpoint, space: Space,
+    rays: RayList, sensor: Sensor, view: Viewpoint, space: Space,
     model: RayModel, swept: FreeLogs, workers: Workers, visitor: RayVisitor,
 ) -> None:  # fmt: skip
-    """Follow the rays of a keyframe for a visitor. ``space`` and ``swept`` hold the bricks that they meet.
-
-    ``entry_depths`` (rays) are the depths up to which rays cross none of them, if known. A worker follows one
-    ray after the other.
-    """
+    """Follow the rays of a keyframe for a visitor. ``space`` and ``swept`` hold the bricks that they meet. A
+    worker follows one ray after the other."""
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
     for iteration in range(workers.number * workers.spread):
@@ -161,8 +157,6 @@ def follow_rays(
                 reach = visitor.reach(sensor, model, measured, noise, to_voxels)
                 support, last = reach[0], reach[1]
                 begin, end = 0.0, ti.min(last, model.max_depth)
-                if entry_depths_known == 1:
-                    begin = entry_depths[i]
                 clip(ray, begin, end, space.lower, space.upper)
 
                 sight = Sight(

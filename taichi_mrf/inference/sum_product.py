@@ -8,7 +8,9 @@ Shankar & Michael, "MRFMap: Online Probabilistic 3D Mapping using Forward Ray Se
 the supplement's are marked S.
 
 All rays of a keyframe send a voxel the same, average message (section IV-A), so a keyframe keeps one
-message for each voxel that it sees, and a sweep over it is four steps:
+message for each voxel that it sees. Where none of the rays of a group can have met its surface yet, nu is 0
+and all say the same, so one way through the middle of the group stands for all (ray_list.py). A sweep over
+a keyframe is four steps:
 
     cavity     belief of each voxel without the keyframe's own message                          (6)
     forward    follow each ray: which voxel may have made the measurement?                  (4), (11)
@@ -32,7 +34,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_list import block_ray, listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
@@ -66,7 +68,6 @@ class ForwardPass(Struct):
 
     visibility: F32  # vis_i
     explained: F32  # before_i
-    first: F32  # depth at which the ray enters its first voxel
     voxels: I32  # i
 
 
@@ -79,7 +80,7 @@ class Cast(Bundle):
     sensor: Sensor
     measured: F32  # its measurement, metres
     noise: Template  # of its pixel
-    support: F32  # depth before which no surface can have made the measurement
+    support: F32  # depth before which no surface can have made a measurement of its group
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     pixels: F32  # for how many pixels it stands
 
@@ -108,15 +109,15 @@ def cavity(
 
 @kernel
 def send_messages(
-    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
-    sensor: Sensor, view: Viewpoint, space: Space,
+    rays: RayList, begin_depth: F32, sensor: Sensor, view: Viewpoint, space: Space,
     model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers,
 ) -> None:  # fmt: skip
-    """Follow the rays of a keyframe out and back, and sum up their messages to each voxel.
+    """Follow the rays of a keyframe out and back, from ``begin_depth`` on, and sum up their messages to each
+    voxel.
 
-    A worker follows one ray after the other. It writes each ray's steps into its own part of the trace and
-    reads them on the way back. ``entry_depths`` (rays) holds the depth at which each ray meets its first
-    brick: the first sweep finds it, and later sweeps start there.
+    A worker follows one group of rays after the other: its way in common in front of all surfaces, from there
+    on each ray by itself out and back, and the way in common back. It writes each step into its own part of
+    the trace and reads it on the way back.
     """
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
@@ -125,48 +126,95 @@ def send_messages(
         largest = ti.exp(model.clamp)
         turns = 0
         if iteration % workers.spread == 0:
-            turns = workers.turns(rays.number)
+            turns = workers.turns(rays.group_number)
             trace.steps[worker] = 0
         for turn in range(turns):
-            i = workers.ray(worker, turn)
-            if i < rays.number:
-                measured = rays.depth[i]
-                ray, noise, pixels = listed_ray(rays, i, sensor, view)
-                cast = Cast(
-                    model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                    ray.direction.norm(), ti.cast(pixels, ti.f32),
-                )  # fmt: skip
+            group = workers.ray(worker, turn)
+            if group < rays.group_number:
+                # In front of all surfaces of the group, forward: nu_j is 0, so only vis_i changes.
+                support, first_step = rays.support[group], worker * trace.longest
+                middle = block_ray(rays.groups[group], sensor, view)
+                begin, apart = begin_depth, begin_depth
+                if rays.first[group + 1] - rays.first[group] > 1:  # a ray alone goes all its way by itself
+                    apart = ti.max(begin, ti.min(support, model.max_depth))
+                end = apart
+                clip(middle, begin, end, space.lower, space.upper)
+                common, behind_all, pixels_all = ForwardPass(1.0, 0.0, 0), 0.0, 0.0
+                free_way = _FreeWay(model, swept, trace, first_step, middle.direction.norm())
+                walk_voxels(middle, begin, end, space, _trace_free, common, free_way)
 
-                # The ray ends where its measurement carries no more evidence, or where the map ends.
-                last = sensor.farthest_depth(measured, noise, model.end_sigmas)
-                begin, end = 0.0, ti.min(last, model.max_depth)
-                if entry_depths_known == 1:
-                    begin = entry_depths[i]
-                clip(ray, begin, end, space.lower, space.upper)
+                for i in range(rays.first[group], rays.first[group + 1]):
+                    measured = rays.depth[i]
+                    ray, noise, pixels = listed_ray(rays, i, sensor, view)
+                    cast = Cast(
+                        model, swept, sensor, measured, noise, support,
+                        ray.direction.norm(), ti.cast(pixels, ti.f32),
+                    )  # fmt: skip
 
-                # Step 4, forward, eqs. 4 and 11, from the camera outwards:
-                # before_i = sum_{j<i} nu_j m_j vis_j, vis_i = prod_{k<i} (1 - m_k)^l_k.
-                ahead = ForwardPass(1.0, 0.0, end, 0)
-                first_step = worker * trace.longest
-                walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
-                if entry_depths_known == 0:
-                    entry_depths[i] = ahead.first
-                trace.steps[worker] += ahead.voxels
+                    # The ray ends where its measurement carries no more evidence, or where the map ends.
+                    last = rays.last[i]
+                    begin, end = apart, ti.min(last, model.max_depth)
+                    clip(ray, begin, end, space.lower, space.upper)
 
-                # A ray that gets through to the end of the map may have met its surface there.
-                behind = 0.0
-                if end < last:
-                    behind = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+                    # Step 4, forward, eqs. 4 and 11, from the camera outwards:
+                    # before_i = sum_{j<i} nu_j m_j vis_j, vis_i = prod_{k<i} (1 - m_k)^l_k.
+                    ahead = ForwardPass(common.visibility, 0.0, 0)
+                    own_step = first_step + common.voxels
+                    walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, own_step))
+                    trace.steps[worker] += ahead.voxels
 
-                # Step 5, backward, eqs. 13 and 14, from the far end: occupied = before_i + nu_i vis_i,
-                # empty = before_i + behind_i / (1 - m_i)^l_i, and log(occupied / empty) is sent.
-                for step in range(ahead.voxels):
-                    j = first_step + ahead.voxels - 1 - step
+                    # A ray that gets through to the end of the map may have met its surface there.
+                    behind = 0.0
+                    if end < last:
+                        behind = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+
+                    # Step 5, backward, eqs. 13 and 14, from the far end: occupied = before_i + nu_i vis_i,
+                    # empty = before_i + behind_i / (1 - m_i)^l_i, and log(occupied / empty) is sent.
+                    for step in range(ahead.voxels):
+                        j = own_step + ahead.voxels - 1 - step
+                        weight, free = trace.step[j][0], trace.step[j][1]
+                        density, before = trace.step[j][2], trace.step[j][3]
+                        message = _message(model, before, density, behind, free, largest)
+                        behind += (1.0 - free) * density
+                        add_message(swept.sums, trace.voxel[j], weight, message, swept.scale)
+                    behind_all += cast.pixels * behind
+                    pixels_all += cast.pixels
+
+                # In front of all surfaces, backward: behind_i is the mean of the rays', and for all of them.
+                trace.steps[worker] += common.voxels
+                behind = behind_all / pixels_all
+                for step in range(common.voxels):
+                    j = first_step + step
                     weight, free = trace.step[j][0], trace.step[j][1]
-                    density, before = trace.step[j][2], trace.step[j][3]
-                    message = _message(model, before, density, behind, free, largest)
-                    behind += (1.0 - free) * density
-                    add_message(swept.sums, trace.voxel[j], weight, message, swept.scale)
+                    message = _message(model, 0.0, 0.0, behind, free, largest)
+                    add_message(swept.sums, trace.voxel[j], pixels_all * weight, message, swept.scale)
+
+
+@dataclass(frozen=True)
+class _FreeWay(Bundle):
+    """The way in common of a group, which writes down its steps from ``first_step`` of the trace on."""
+
+    model: RayModel
+    swept: SweptVoxels
+    trace: Trace
+    first_step: I32
+    voxels_per_depth: F32
+
+
+@ti.func
+def _trace_free(ahead: Template, way: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the way in common, in which no surface can have made a measurement."""
+    length, log_free = passage(way, voxel, near, far)
+    if ti.static(not way.model.segment_lengths):
+        length = 1.0
+    free = exp_of_negative(log_free)
+    j = way.first_step + ahead.voxels
+    way.trace.voxel[j] = voxel
+    way.trace.step[j][0] = length
+    way.trace.step[j][1] = free
+    ahead.visibility *= free
+    ahead.voxels += 1
+    return 1
 
 
 @dataclass(frozen=True)
@@ -179,12 +227,19 @@ class _Traced(Bundle):
 
 
 @ti.func
+def passage(way: Template, voxel: I32, near: F32, far: F32):
+    """l_i and log(1 - m_i)^l_i of a voxel, in which a ray is from depth ``near`` to ``far``."""
+    length = (far - near) * way.voxels_per_depth
+    log_free = way.swept.log_free[voxel]
+    if ti.static(way.model.segment_lengths):
+        log_free *= length
+    return length, log_free
+
+
+@ti.func
 def crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
     """l_i, log(1 - m_i)^l_i and nu_i of a voxel, in which the ray is from depth ``near`` to ``far``."""
-    length = (far - near) * cast.voxels_per_depth
-    log_free = cast.swept.log_free[voxel]
-    if ti.static(cast.model.segment_lengths):
-        log_free *= length
+    length, log_free = passage(cast, voxel, near, far)
     density = 0.0
     if far > cast.support:
         density = cast.sensor.likelihood(cast.measured, near, far, cast.noise, cast.model.voxel_size, AUTO)
@@ -210,8 +265,6 @@ def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: 
     """One voxel of the forward pass, written down in the trace."""
     met = crossing(traced.cast, voxel, near, far)
     met[0] = _weight(traced.cast, met[0])
-    if ahead.voxels == 0:
-        ahead.first = near
     j = traced.first_step + ahead.voxels
     traced.trace.voxel[j] = voxel
     traced.trace.step[j] = _explain(ahead, met)

@@ -124,9 +124,7 @@ class SurfaceRays:
         self._field_index.fill(window, cells, slots)
         lower, upper = self.volume.lower, self.volume.upper
         follow_rays(
-            # From the camera on: where a ray begins rounds otherwise, and a loaded map knows no entry depths.
-            keyframe.ray_list, keyframe.entry_depths, 0,
-            keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
+            keyframe.ray_list, keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
             self._index.space(window, lower, upper), self.model, self._free_logs, workers_without_trace(),
             AddDistances(self.model.floor, self.band, self._field_index.space(window, lower, upper), sums),
         )  # fmt: skip

@@ -57,8 +57,7 @@ def count_votes(
             window = keyframe.footprint.window
             index.fill(window, visible.cells, visible.slots)
             follow_rays(
-                keyframe.ray_list, keyframe.entry_depths, 0,
-                keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
+                keyframe.ray_list, keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
                 index.space(window, volume.lower, volume.upper),
                 model, free_logs, workers_without_trace(), vote,
             )  # fmt: skip

@@ -11,7 +11,7 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
-from taichi_mrf.inference.keyframe import Keyframe, RayList
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits, RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
@@ -21,7 +21,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint
+from taichi_mrf.voxels.traversal import Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
 
 TRACE_BYTES = 20
@@ -33,13 +33,6 @@ def least_log_odds(free_share: float, clamp: float, prior_log_odds: float) -> fl
     the ``clamp``."""
     chance = free_share / (1.0 + math.exp(-prior_log_odds))
     return -clamp if chance == 0 else max(-clamp, math.log(chance / (1.0 - chance)))
-
-
-def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
-    """Entry depths, (rays), before the first sweep has found them."""
-    entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
-    entry_depths.fill(FAR)
-    return entry_depths
 
 
 @dataclass(frozen=True)
@@ -125,10 +118,9 @@ class Sweeper:
                 parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers)
                 send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
             sum_product.send_messages(
-                keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
-                keyframe.image.sensor, cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
+                keyframe.ray_list, 0.0, keyframe.image.sensor,
+                cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
             )  # fmt: skip
-            keyframe.entry_depths_known = True
             if keyframe.no_returns is not None:
                 take_where_unmeasured(
                     len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
@@ -151,10 +143,9 @@ class Sweeper:
         """The scratch made ready for a keyframe's rays; it must see a brick. It holds the cavity of
         ``belief`` (pool * 512) without ``messages`` (eq. 6), and sums of zero, to which rays add."""
         visible, footprint, n = keyframe.visible, keyframe.footprint, len(keyframe.visible.slots)
-        workers = workers_for(
-            runtime.active() or "cpu", runtime.is_software(), footprint.longest, TRACE_BYTES
-        )
-        self._reserve(n, workers.number * footprint.longest, workers.number)
+        longest = 2 * footprint.longest  # a group's way in common, and that of one of its rays
+        workers = workers_for(runtime.active() or "cpu", runtime.is_software(), longest, TRACE_BYTES)
+        self._reserve(n, workers.number * longest, workers.number)
         window, bricks = footprint.window, visible.on_device()
         swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
         sum_product.cavity(
@@ -168,7 +159,7 @@ class Sweeper:
             window.viewpoint(keyframe.T_world_camera),
             self.index.space(window, self.volume.lower, self.volume.upper),
             swept,
-            Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
+            Trace(self.trace_voxel, self.trace, longest, self.steps),
             workers,
             lambda: self.index.clear(window, bricks.cells),
         )

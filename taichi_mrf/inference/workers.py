@@ -1,4 +1,5 @@
-"""Division of a keyframe's rays among workers: runs of neighbouring rays, which cross the same bricks."""
+"""Division of a keyframe's rays, or groups of rays, among workers: runs of neighbours, which cross the same
+bricks."""
 
 from dataclasses import dataclass
 
@@ -44,7 +45,7 @@ def workers_for(arch: str, software: bool, longest: int, trace_bytes: int) -> Wo
     """
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 256, 512, 0)
+        return Workers(64, 64, 512, 0)
     if software:
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (trace_bytes * longest)

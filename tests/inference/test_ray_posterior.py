@@ -63,7 +63,7 @@ def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
     here = np.zeros(pool.capacity * VOXELS, np.float32)
     found = np.zeros((k.ray_list.number, 3), np.float32)
     follow_rays(
-        k.ray_list, k.entry_depths, int(k.entry_depths_known), k.image.sensor,
+        k.ray_list, k.image.sensor,
         window.viewpoint(k.T_world_camera), index.space(window), model, FreeLogs.of(pool, model),
         workers_without_trace(), _Record(here, found.reshape(-1), enough),
     )  # fmt: skip

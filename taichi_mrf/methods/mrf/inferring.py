@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.inference.schedule import InferSteps, content_key, driven, sweep_steps
-from taichi_mrf.inference.sweep import unknown_entry_depths
 from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.system.compiler import ti
@@ -55,9 +54,6 @@ def infer_steps(
         chosen = sorted(parts.keyframes.values(), key=content_key)
         pool.restart()
         for keyframe in chosen:
-            # Entry depths of earlier sweeps would change the rounding of rays, so they start over too.
-            keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
-            keyframe.entry_depths_known = False
             keyframe.messages = None
             parts.allocator.refresh(keyframe)
         parts.messages_lost = False

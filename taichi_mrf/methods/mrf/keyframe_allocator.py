@@ -14,7 +14,6 @@ from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
 from taichi_mrf.inference.no_returns import no_return_rays
 from taichi_mrf.inference.ray_list import RayBundler
-from taichi_mrf.inference.sweep import unknown_entry_depths
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
@@ -83,8 +82,7 @@ class KeyframeAllocator:
         """Claim the bricks and return the keyframe, counted in the budget."""
         self.registry.claim(footprint)
         self.bounds.put(id, footprint.window)
-        visible, entry_depths = self.registry.visible(footprint), unknown_entry_depths(rays)
-        placed = (T_world_camera, stamp_s, footprint, visible, entry_depths)
+        placed = (T_world_camera, stamp_s, footprint, self.registry.visible(footprint))
         keyframe = Keyframe(id, name, image, rays, *placed, no_returns=no_returns)
         self.budget.take(keyframe)
         return keyframe
@@ -145,8 +143,6 @@ class KeyframeAllocator:
         if keyframe.pending_visible is not None:
             keyframe.change_count_at_last_sweep = change_count_seen_by(keyframe, keyframe.pending_visible)
             keyframe.visible, keyframe.pending_visible = keyframe.pending_visible, None
-            keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
-            keyframe.entry_depths_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.precision)
             self.budget.mark_allocated(keyframe.id)
