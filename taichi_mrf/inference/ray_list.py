@@ -206,8 +206,8 @@ def _choose(
     """Give each pixel the levels of the block and the group that begin there, or -1 if none does; count them
     by tile.
 
-    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` and ``groups`` (tiles) receive the numbers
-    of rays and of groups with rays.
+    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` and ``groups`` (tiles) receive the
+    numbers of rays and of groups with rays.
     """
     width = sensor.camera.width
     height = depth.shape[0] // width

@@ -62,6 +62,11 @@ TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
 
 
+CLEAR_VOXELS = 2.0
+"""Rays part this many voxels in front of the first of their surfaces: more than the longest way through one,
+so that no voxel is told by the way in common that it is free, in which a surface may be."""
+
+
 @ti.dataclass
 class ForwardPass(Struct):
     """A ray on its way from the camera, in front of voxel i."""
@@ -136,7 +141,9 @@ def send_messages(
                 middle = block_ray(rays.groups[group], sensor, view)
                 begin, apart = begin_depth, begin_depth
                 if rays.first[group + 1] - rays.first[group] > 1:  # a ray alone goes all its way by itself
-                    apart = ti.max(begin, ti.min(support, model.max_depth))
+                    # The voxel in which the rays part is one in which none of them can have met its surface.
+                    apart = ti.min(support, model.max_depth) - CLEAR_VOXELS / middle.direction.norm()
+                    apart = ti.max(begin, apart)
                 end = apart
                 clip(middle, begin, end, space.lower, space.upper)
                 common, behind_all, pixels_all = ForwardPass(1.0, 0.0, 0), 0.0, 0.0

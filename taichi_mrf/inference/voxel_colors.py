@@ -83,7 +83,8 @@ class ColorPass:
                 200.0 * s.voxel_size * s.inference.ray_density,
             )  # fmt: skip
             follow_rays(
-                keyframe.ray_list, image.sensor, cast.view, cast.space, model, free_logs, cast.workers, spread,
+                keyframe.ray_list, image.sensor, cast.view, cast.space,
+                model, free_logs, cast.workers, spread,
             )  # fmt: skip
         weigh(n * VOXELS, cast.swept.sums, self._bw, scale)
         runtime.settle()

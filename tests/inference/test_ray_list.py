@@ -1,4 +1,4 @@
-"""The list of rays: blocks that agree, the rest pixel by pixel, and nothing twice."""
+"""The list of rays: blocks that agree, the rest pixel by pixel, and nothing twice; groups of whole blocks."""
 
 import numpy as np
 import pytest
@@ -12,12 +12,16 @@ from taichi_mrf.inference.ray_list import (
     AGREE_SIGMAS,
     AGREE_VOXELS,
     BITS,
+    FREE_RAYS,
     LEVELS,
     TILE,
     RayBundler,
+    rays_per_voxel,
     stride_metres,
 )
+from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.forward import SUPPORT
 from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -44,17 +48,32 @@ Block = tuple[int, int, int, int]
 
 def blocks_of(rays: RayList, width: int) -> list[tuple[Block, float]]:
     """The block and the depth of each ray."""
-    numbers = rays.blocks.to_numpy()[: rays.number]
+    depths = rays.depth.to_numpy()[: rays.number].tolist()
+    return list(zip(_unpacked(rays.blocks.to_numpy()[: rays.number], width), depths, strict=True))
+
+
+def groups_of(rays: RayList, width: int) -> list[tuple[Block, range]]:
+    """The block of each group, and its rays."""
+    first = rays.first.to_numpy()[: rays.group_number + 1].tolist()
+    blocks = _unpacked(rays.groups.to_numpy()[: rays.group_number], width)
+    return list(zip(blocks, map(range, first[:-1], first[1:]), strict=True))
+
+
+def _unpacked(numbers: NDArray[np.int32], width: int) -> list[Block]:
     pixels, levels = numbers >> BITS, numbers & ((1 << BITS) - 1)
     columns = (pixels % width, pixels // width, 2 ** ((levels + 1) // 2), 2 ** (levels // 2))
-    depths = rays.depth.to_numpy()[: rays.number].tolist()
-    return list(zip(zip(*(c.tolist() for c in columns), strict=True), depths, strict=True))
+    return list(zip(*(c.tolist() for c in columns), strict=True))
 
 
-def oracle(depth: NDArray[np.float32], density: float) -> dict[Block, float]:
-    """Blocks from single pixels up, as long as two of a size lie together, are few enough and agree."""
+def oracle(depth: NDArray[np.float32], density: float, groups: bool = False) -> dict[Block, float]:
+    """Blocks from single pixels up, as long as two of a size lie together, are few enough and agree; groups
+    need not agree, and may hold pixels without a measurement."""
     height, width = depth.shape
-    stride = stride_metres(camera_of(width, height), VOXEL, density)
+    per_voxel = rays_per_voxel(VOXEL, density)
+    per_voxel = min(per_voxel, FREE_RAYS) if groups else per_voxel
+    stride = stride_metres(camera_of(width, height), VOXEL, per_voxel)
+    if groups:
+        depth = np.where(depth > 0, depth, np.inf)
     found = {(u, v, 1, 1): float(depth[v, u]) for v, u in zip(*np.nonzero(depth), strict=True)}
     wide, high = 1, 1
     for _ in range(LEVELS):
@@ -67,11 +86,18 @@ def oracle(depth: NDArray[np.float32], density: float) -> dict[Block, float]:
                     (u + wide - half_wide, v + high - half_high, half_wide, half_high),
                 ]
                 patch = depth[v : v + high, u : u + wide]
-                agrees = np.ptp(patch) <= max(AGREE_VOXELS * VOXEL, AGREE_SIGMAS * SIGMA_M)
-                fits = wide * high * patch.min() ** 2 <= stride**2
+                agrees = groups or np.ptp(patch) <= max(AGREE_VOXELS * VOXEL, AGREE_SIGMAS * SIGMA_M)
+                fits = np.isinf(patch.min()) or wide * high * patch.min() ** 2 <= stride**2
                 if all(part in found for part in parts) and fits and agrees:
                     found[u, v, wide, high] = float(np.mean([found.pop(part) for part in parts]))
+    if groups:
+        return {key: 0.0 for key in found if np.isfinite(_part(depth, key)).any()}
     return found
+
+
+def _part(image: NDArray, block: Block) -> NDArray:
+    u, v, wide, high = block
+    return image[v : v + high, u : u + wide]
 
 
 @settings(max_examples=40)
@@ -99,7 +125,22 @@ def test_bundles_are_those_of_the_oracle(
     for u0, v0, wide, high in found:
         covered[v0 : v0 + high, u0 : u0 + wide] += 1
     np.testing.assert_array_equal(covered, depth > 0)
-    assert rays.widest == max((wide for _, _, wide, _ in found), default=1)
+
+    listed_blocks = [block for block, _ in blocks_of(rays, width)]
+    groups = groups_of(rays, width)
+    expected_groups = oracle(depth, wanted / 10, groups=True)
+    assert len({block for block, _ in groups} ^ expected_groups.keys()) <= 0.02 * len(expected_groups)
+    assert [i for _, members in groups for i in members] == list(range(rays.number))
+    last, support = rays.last.to_numpy(), rays.support.to_numpy()
+    for number, ((u0, v0, wide, high), members) in enumerate(groups):
+        assert len(members) > 0
+        for u, v, columns, rows in (listed_blocks[i] for i in members):
+            assert u0 <= u <= u + columns <= u0 + wide
+            assert v0 <= v <= v + rows <= v0 + high
+        depths = [found[listed_blocks[i]] for i in members]
+        assert support[number] == pytest.approx(min(depths) - SUPPORT * SIGMA_M, abs=1e-5)
+        np.testing.assert_allclose(last[list(members)], np.array(depths) + END_SIGMAS * SIGMA_M, atol=1e-5)
+    assert rays.widest == max((wide for (_, _, wide, _), _ in groups), default=1)
 
 
 @pytest.mark.parametrize("parameters", [{"ray_density": 0.0}, {"ray_density": 1e9}])

@@ -109,10 +109,11 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
     pass_through=st.sampled_from([0.0, 0.2]),
     sweeps=st.integers(1, 5),
     free_share=st.sampled_from([0.0, 0.25, 1.0]),
+    alone=st.booleans(),
 )
 @example(
     seed=420930, pixels=(2, 1), count=3, sigma=0.0625, made_by=ExactMap,
-    pass_through=0.0, sweeps=1, free_share=0.0,
+    pass_through=0.0, sweeps=1, free_share=0.0, alone=True,
 )  # fmt: skip
 def test_loops_equal_the_numpy_schedule(
     seed: int,
@@ -123,12 +124,16 @@ def test_loops_equal_the_numpy_schedule(
     pass_through: float,
     sweeps: int,
     free_share: float,
+    alone: bool,
 ) -> None:
+    """By each ray for itself, and by rays with a way in common."""
     rng = np.random.default_rng(seed)
-    camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
+    focal = 8.0 if alone else 20.0  # pixels close enough for a group, and never for one ray
+    camera = PinholeCamera(pixels[0], pixels[1], focal, focal, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
     config = InferenceConfig(
-        sweeps=sweeps, pass_through=pass_through, outlier_floor=1e-3, free_share=free_share
-    )
+        sweeps=sweeps, pass_through=pass_through, outlier_floor=1e-3, free_share=free_share,
+        ray_density=0.0 if alone else 1e3,
+    )  # fmt: skip
     sensor = Noise((sigma,), (0.01,))
     m = made_by(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)
     rays = {}
@@ -142,7 +147,10 @@ def test_loops_equal_the_numpy_schedule(
             # Rays of so small an image are no neighbours: each may cross bricks that no other one does.
             patch.setattr(keyframe_allocator, "SCOUTS", 1)
             id = m.add_keyframe(depth, T, camera)
-        rays[id] = reference.cast(depth, T, camera, VOXEL, sensor, max_depth=1.5)
+        if alone or pixels == (1, 1):
+            rays[id] = reference.cast(depth, T, camera, VOXEL, sensor, max_depth=1.5)
+        else:
+            rays[id] = [reference.cast_as_group(depth, T, camera, VOXEL, sensor, max_depth=1.5)]
     assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))
     order = sorted(m.keyframes.values(), key=content_key)
     voxels = allocated(m)

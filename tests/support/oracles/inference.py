@@ -14,7 +14,9 @@ from oracles.forward import Noise
 from oracles.traversal import segments
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits
+from taichi_mrf.inference.sum_product import CLEAR_VOXELS
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.forward import SUPPORT
 
 Voxel = tuple[int, int, int]
 
@@ -38,6 +40,42 @@ class Ray:
     told: frozenset[Voxel] | None = None
 
 
+@dataclass(frozen=True)
+class Group:
+    """Rays with a way in common, which goes through the middle of their pixels; theirs begin where it ends."""
+
+    common: list[Segment]
+    rays: list[Ray]
+    told: None = None
+
+    @property
+    def segments(self) -> list[Segment]:
+        return self.common + [segment for ray in self.rays for segment in ray.segments]
+
+
+def cast_as_group(
+    depth_m: NDArray[np.float32],
+    T: NDArray[np.float64],
+    camera: PinholeCamera,
+    voxel_size: float,
+    noise: Noise,
+    max_depth: float,
+) -> Group:
+    """All rays of a depth image without a gap as one group."""
+    height, width = camera.shape
+    middle = T[:3, :3] @ np.array(
+        [((width - 1) / 2 - camera.cx) / camera.fx, ((height - 1) / 2 - camera.cy) / camera.fy, 1.0]
+    )
+    nearest = min(float(noise.depth_of_deviation(float(depth), SUPPORT)) for depth in depth_m.flat)
+    apart = max(0.0, min(nearest, max_depth) - CLEAR_VOXELS * voxel_size / float(np.linalg.norm(middle)))
+    cells, near, far = segments(T[:3, 3], middle, 0.0, apart, voxel_size)
+    lengths = (far - near) * np.linalg.norm(middle) / voxel_size
+    common = [
+        Segment((int(i), int(j), int(k)), float(x)) for (i, j, k), x in zip(cells, lengths, strict=True)
+    ]
+    return Group(common, cast(depth_m, T, camera, voxel_size, noise, max_depth, apart))
+
+
 def cast(
     depth_m: NDArray[np.float32],
     T: NDArray[np.float64],
@@ -45,8 +83,9 @@ def cast(
     voxel_size: float,
     noise: Noise,
     max_depth: float,
+    begin: float = 0.0,
 ) -> list[Ray]:
-    """All rays of a depth image, with the likelihood of each segment."""
+    """All rays of a depth image from depth ``begin`` on, with the likelihood of each segment."""
     rays = []
     directions = camera.rays()
     for v, u in np.argwhere(depth_m > 0):
@@ -54,7 +93,7 @@ def cast(
         direction = T[:3, :3] @ directions[v, u]
         last = float(noise.depth_of_deviation(measured, -END_SIGMAS))
         end = min(last, max_depth)
-        cells, near, far = segments(T[:3, 3], direction, 0.0, end, voxel_size)
+        cells, near, far = segments(T[:3, 3], direction, begin, end, voxel_size)
         lengths = (far - near) * np.linalg.norm(direction) / voxel_size
         centre = 0.5 * (near + far)
         density = np.where(
@@ -88,8 +127,40 @@ def ray_messages(
     ``incoming`` are log-odds of the voxels as the ray sees them; voxels that it does not hold do not
     exist, and the ray passes through them.
     """
+    return _messages_from(1.0, ray, incoming, config, limits)[0]
+
+
+def group_messages(
+    group: Group, incoming: dict[Voxel, float], config: InferenceConfig, limits: Limits
+) -> list[tuple[Voxel, float, float]]:
+    """The same for a group: the way in common counts for each of its rays, and what lies behind it is the mean
+    of what lies behind them."""
+    passed, visibility = [], 1.0
+    for segment in group.common:
+        if segment.voxel in incoming:
+            m = (1 - (config.pass_through or 0.0)) * logistic(incoming[segment.voxel])
+            passed.append((segment, (1 - m) ** (segment.length if limits.segment_lengths else 1.0)))
+            visibility *= passed[-1][1]
+    out, behind = [], []
+    for ray in group.rays:
+        messages, beyond = _messages_from(visibility, ray, incoming, config, limits)
+        out += messages
+        behind.append(beyond)
+    for segment, free in passed:
+        empty = float(np.mean(behind)) / free + config.floor
+        occupied = config.floor
+        occupied += (config.pass_through or 0.0) * (empty - occupied)
+        weight = segment.length if limits.segment_lengths else 1.0
+        out.append((segment.voxel, weight * len(group.rays), occupied / (occupied + empty)))
+    return out
+
+
+def _messages_from(
+    visibility: float, ray: Ray, incoming: dict[Voxel, float], config: InferenceConfig, limits: Limits
+) -> tuple[list[tuple[Voxel, float, float]], float]:
+    """The messages of a ray that begins with a ``visibility``, and the density that lies behind its start."""
     steps = []
-    visibility, explained = 1.0, 0.0
+    explained = 0.0
     for segment, density in zip(ray.segments, ray.densities, strict=True):
         if segment.voxel not in incoming:
             continue
@@ -108,11 +179,11 @@ def ray_messages(
         weight = segment.length if limits.segment_lengths else 1.0
         out.append((segment.voxel, weight, occupied / (occupied + empty)))
         behind += (1 - free) * here
-    return out
+    return out, behind
 
 
 def infer(
-    keyframes: list[list[Ray]],
+    keyframes: list[list[Ray]] | list[list[Group]],
     voxels: set[Voxel],
     prior: float,
     config: InferenceConfig,
@@ -130,7 +201,8 @@ def infer(
             weights: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             sums: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             for ray in rays:
-                for voxel, weight, q in ray_messages(ray, incoming, config, limits):
+                messages_of = group_messages if isinstance(ray, Group) else ray_messages
+                for voxel, weight, q in messages_of(ray, incoming, config, limits):
                     if ray.told is not None and voxel not in ray.told:
                         continue
                     log_odds = logit(min(1 - 1e-16, max(1e-300, q)))
