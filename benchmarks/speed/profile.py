@@ -90,8 +90,9 @@ class Work:
 FLOORS: Mapping[str, Mapping[str, Floor]] = {
     "allocate": {
         "ext_arr_to_ndarray": lambda w: 8 * w.pixels,  # the depth image, to the device
-        "_choose": lambda w: 20 * w.pixels,  # depth in; nearest, farthest, mean, level out
-        "_write_down": lambda w: 4 * w.pixels + 12 * w.rays,  # levels and means in, the list out
+        "_choose": lambda w: 24 * w.pixels,  # depth in; nearest, farthest, mean, two levels out
+        "_write_down": lambda w: 8 * w.pixels + 12 * w.rays,  # levels and means in, the list out
+        "_find_reach": lambda w: 12 * w.rays,  # the list in, depths out
         "_mark": lambda w: 8 * w.rays + 4 * w.crossed,  # the list in, marks out
         "read": lambda w: 20 * (w.surface + w.crossed),  # coordinates and the tree in, slots out
         "fill_bricks": lambda w: (4 + 4 * VOXELS) * w.created,

@@ -42,7 +42,7 @@ class Ray:
 
 @dataclass(frozen=True)
 class Group:
-    """Rays with a way in common, which goes through the middle of their pixels; theirs begin where it ends."""
+    """Rays with a way in common through the middle of their pixels; their own ways begin where it ends."""
 
     common: list[Segment]
     rays: list[Ray]
@@ -133,8 +133,8 @@ def ray_messages(
 def group_messages(
     group: Group, incoming: dict[Voxel, float], config: InferenceConfig, limits: Limits
 ) -> list[tuple[Voxel, float, float]]:
-    """The same for a group: the way in common counts for each of its rays, and what lies behind it is the mean
-    of what lies behind them."""
+    """The same for a group: the way in common counts for each of its rays, and has the mean of what lies
+    behind them."""
     passed, visibility = [], 1.0
     for segment in group.common:
         if segment.voxel in incoming:
