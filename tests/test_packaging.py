@@ -1,6 +1,8 @@
 """The wheel holds what the program needs, and runs where nothing of the source tree can be found."""
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,8 +12,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import taichi_mrf
+from taichi_mrf.cli.parser import parse
 
 SOURCES = ("taichi_mrf", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE")
 
@@ -82,3 +86,26 @@ def test_an_installed_wheel_maps_with_a_shipped_configuration(clean_python: Path
     arguments = ("--config", "kinect1", "--voxel-size", "0.2", "--out", "run")
     run("taichi-mrf", "map", "synthetic:room?frames=2", *arguments)
     assert (tmp_path / "run" / "report.json").is_file()
+
+
+def test_the_citation_names_this_version(repository: Path) -> None:
+    facts = yaml.safe_load((repository / "CITATION.cff").read_text(encoding="utf-8"))
+    assert facts["version"] == taichi_mrf.__version__
+    assert facts["license"] == "MIT"
+
+
+def test_workflows_and_containers_name_what_there_is(repository: Path) -> None:
+    """The folders of tests, the commands and the extras in files that no other test runs."""
+    workflow = (repository / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8")
+    for job in yaml.safe_load(workflow)["jobs"].values():
+        for word in " ".join(step.get("run", "") for step in job["steps"]).split():
+            if word.startswith(("tests/", ".ci/")):
+                assert (repository / word).exists(), word
+    service = yaml.safe_load((repository / "compose.yaml").read_text(encoding="utf-8"))["services"]["live"]
+    recipe = (repository / "Dockerfile").read_text(encoding="utf-8")
+    assert f"CMD {json.dumps(service['command'])}" in recipe
+    parse(service["command"])
+    (extras,) = re.findall(r'"/source\[([\w,]+)\]"', recipe)
+    project = (repository / "pyproject.toml").read_text(encoding="utf-8")
+    for extra in extras.split(","):
+        assert re.search(rf"^{extra} = \[", project, re.MULTILINE), extra

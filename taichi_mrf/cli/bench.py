@@ -17,6 +17,7 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
@@ -28,6 +29,13 @@ if TYPE_CHECKING:
 
 Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None"]
 """Measurements: tables to print, figures to write, and what draws them, if they can be drawn."""
+
+
+RATIOS = {"ratio_alone": "a keyframe without re-inference", "ratio_whole": "a keyframe"}
+"""The figures that ``--gate`` compares, and their names."""
+
+WORSE = 1.1
+"""A ratio that has grown by more than this factor is worse."""
 
 
 class BenchRun:
@@ -79,10 +87,12 @@ def run_bench(
     measure: Callable[[BenchRun], Measured] = measure_stages,
     profile: bool = False,
 ) -> int:
-    """Measure, print, write and draw; always 0. With ``profile`` Taichi times each kernel.
+    """Measure, print, write and draw; 1 if ``--gate`` finds a ratio that has become worse, else 0. With
+    ``profile`` Taichi times each kernel.
 
     Raises TaichiMRFError.
     """
+    allowed = {} if options.gate is None else _ratios_in(options.gate, options)
     console = open_terminal(options.printing)
     wanted = options.settings.runtime
     runtime.init(wanted.arch, wanted.threads, profile=profile)
@@ -102,7 +112,42 @@ def run_bench(
         write_text(options.json, json.dumps(report, indent=2) + "\n")
     if options.plot is not None and draw is not None:
         write_figure(draw(), options.plot)
-    return 0
+    worse = _worse(figures, allowed)
+    for line in worse:
+        console.print_line(line)
+    return 1 if worse else 0
+
+
+def _ratios_in(path: Path, options: Bench) -> dict[tuple[float, str], float]:
+    """The ratios in a file of ``--json``, by voxel size and name. Raises ConfigError, before anything is
+    measured, if they cannot be compared with those of a run with the options."""
+    if not octomap_available():
+        raise ConfigError("--gate compares with OctoMap: pip install 'taichi-mrf[bench]' brings it")
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+        rows = {row["voxel_size"]: row for row in report["rows"]}
+        ratios = {(size, name): float(rows[size][name]) for size in options.voxel_sizes for name in RATIOS}
+    except OSError as error:
+        raise ConfigError(f"--gate {path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        sizes = " ".join(f"{size:g}" for size in options.voxel_sizes)
+        raise ConfigError(
+            f"--gate {path}: holds no ratios to OctoMap for voxels of {sizes} m; taichi-mrf bench --json "
+            "writes such a file"
+        ) from error
+    if report.get("source") != options.source:
+        raise ConfigError(f"--gate {path}: was measured on {report.get('source')}, not on {options.source}")
+    return ratios
+
+
+def _worse(rows: Sequence[dict[str, Any]], allowed: dict[tuple[float, str], float]) -> list[str]:
+    """A line for each ratio that is more than WORSE of what is allowed."""
+    return [
+        f"{row['voxel_size']:g} m: {RATIOS[name]} takes {row[name]:.3f} of OctoMap's time, {then:.3f} before"
+        for row in rows
+        for (size, name), then in allowed.items()
+        if size == row["voxel_size"] and row[name] > WORSE * then
+    ]
 
 
 def _advance(progress: ProgressBar, stage: str, total: int, done: int) -> None:

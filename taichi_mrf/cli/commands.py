@@ -79,6 +79,7 @@ _BENCH_FLAGS = (
     "octomap",
     "json",
     "plot",
+    "gate",
     "runtime.arch",
 )
 

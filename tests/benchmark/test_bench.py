@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_room
+from console import taichi_mrf
 
 from benchmarks.speed import profile
 from benchmarks.speed.bandwidth import copy_bandwidth
@@ -19,6 +20,7 @@ from benchmarks.speed.growth import elsewhere, fit_line, measure_growth
 from benchmarks.speed.profile import COPIES, FLOORS, Work, host_seconds
 from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
 from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, live_stages
+from taichi_mrf.cli import bench as bench_command
 from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
@@ -95,6 +97,38 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     else:
         assert row["ratio_whole"] is None
         assert "taichi-mrf[bench]" in text
+
+
+def test_the_gate_closes_when_a_ratio_has_grown(tmp_path: Path) -> None:
+    if not octomap_available():
+        pytest.skip("OctoMap is not installed: pip install 'taichi-mrf[bench]'")
+    options = Bench(source=TINY, voxel_sizes=(0.1,))
+    before, rows = tmp_path / "before.json", [{"voxel_size": 0.1, "ratio_alone": 0.2, "ratio_whole": 0.3}]
+    before.write_text(json.dumps({"source": TINY, "rows": rows}))
+    allowed = bench_command._ratios_in(before, options)
+    assert bench_command._worse(rows, allowed) == []
+    slower = [{"voxel_size": 0.1, "ratio_alone": 0.21, "ratio_whole": 0.34}]
+    (line,) = bench_command._worse(slower, allowed)
+    assert line == "0.1 m: a keyframe takes 0.340 of OctoMap's time, 0.300 before"
+    with pytest.raises(ConfigError, match=r"for voxels of 0\.05 0\.1 m"):
+        bench_command._ratios_in(before, Bench(source=TINY, voxel_sizes=(0.05, 0.1)))
+    with pytest.raises(ConfigError, match=r"was measured on .*room.*, not on kitchen"):
+        bench_command._ratios_in(before, Bench(source="kitchen", voxel_sizes=(0.1,)))
+    with pytest.raises(ConfigError, match="leave out --no-octomap"):
+        Bench(gate=before, octomap=False)
+
+
+def test_a_run_ends_with_what_the_gate_says(tmp_path: Path) -> None:
+    if not octomap_available():
+        pytest.skip("OctoMap is not installed: pip install 'taichi-mrf[bench]'")
+    before = tmp_path / "before.json"
+    tiny = {"voxel_size": 0.1, "ratio_alone": 1e-6, "ratio_whole": 1e9}
+    before.write_text(json.dumps({"source": TINY, "rows": [tiny]}))
+    command = ["bench", TINY, "--voxel-sizes", "0.1", "--frames", "2", "--gate", str(before)]
+    done = taichi_mrf(*command, "--runtime.arch", "cpu")
+    assert done.returncode == 1
+    assert "a keyframe without re-inference takes" in done.stdout
+    assert "0.000 before" in done.stdout
 
 
 def test_every_kernel_with_a_floor_is_found_in_a_profile(tmp_path: Path) -> None:

@@ -37,6 +37,10 @@ class Bench:
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Draw the figures to this file (.png, .svg or .pdf)."""
 
+    gate: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Compare the ratios to OctoMap with those of an earlier --json FILE, made of the same source; end with
+    exit status 1 if one of them is more than 10% worse."""
+
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
 
@@ -47,6 +51,8 @@ class Bench:
         check_least(self, frames=1)
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")
+        if self.gate is not None and not self.octomap:
+            raise ConfigError("--gate compares with OctoMap: leave out --no-octomap")
 
 
 @dataclass(frozen=True)
