@@ -14,7 +14,7 @@ from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.options.config_file import laser_parameters, live_parameters, mapping_parameters
 from taichi_mrf.cli.options.doctor import Doctor
 from taichi_mrf.cli.options.laser import Laser
-from taichi_mrf.cli.options.live import Live
+from taichi_mrf.cli.options.live import Demo, Live
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.measure import Bench, Eval
 from taichi_mrf.cli.options.saved_maps import Diff, Export, Import, Info
@@ -99,6 +99,7 @@ _LASER_FLAGS = (
 COMMANDS = {
     "map": Command(Map, "taichi_mrf.cli.map.run:run_map", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
+    "demo": Command(Demo, "taichi_mrf.cli.live:run_live", live_parameters, ("voxel-size", "port", "open")),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),

@@ -86,3 +86,14 @@ class Live:
             raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
         check_port(self.port)
         self.noise.refuse_with(track_poses=self.poses.track_poses)
+
+
+@dataclass(frozen=True)
+class Demo(Live):
+    """See what the program does: map a built-in room, and open the page that shows it in a browser.
+
+    The same as live without a SOURCE, with --open. Ctrl-C ends it.
+    """
+
+    open: bool = True
+    """Open the page in a browser on this machine."""
