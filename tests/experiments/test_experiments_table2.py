@@ -62,7 +62,7 @@ def row_of(table: Table, name: str) -> dict[str, Any]:
 
 
 def mrf_map(scene: Scene, size: float, keyframes: tuple[int, ...]) -> MRFMap:
-    m = MRFMap(size, scene.noise, volume=scene.volume, max_depth=scene.max_depth)
+    m = MRFMap(size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, ray_density=0.0)
     for index in keyframes:
         view = scene.views[index]
         m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
