@@ -26,7 +26,7 @@ run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
 
 check: style
-	@$(BIN)/python tests/backends.py --quick --quiet -r fE
+	@$(BIN)/python tests/backends.py --quick -r fE
 
 test: style
 	@$(BIN)/python tests/backends.py

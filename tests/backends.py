@@ -38,8 +38,9 @@ def main() -> int:
     processes, others = (QUICK_PROCESSES, []) if quick else (PROCESSES, others)
     with ExitStack() as stack:
         queue = stack.enter_context(tempfile.TemporaryDirectory())
-        command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
-        share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
+        command = [sys.executable, "-m", "pytest", "--quiet", *sys.argv[1:], "--arch"]
+        # The folder in one word: pytest takes it for tests. No part of the whole, which no process knows.
+        share = [*command, first, f"--queue={queue}", "-o", "console_output_style=classic"]
         beside = {arch: [*command, arch] for arch in others}
         beside["mypy"] = [sys.executable, "-m", "mypy"]
         beside |= {_name(first, number, processes): share for number in range(2, processes + 1)}

@@ -8,6 +8,7 @@ software device will do).
 import importlib.util
 import multiprocessing.process
 import os
+import re
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -23,7 +24,14 @@ from taichi_mrf.system import runtime
 SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
 """Where hypothesis keeps what @settings said; it has no public way to ask."""
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+HERE = Path(__file__).resolve().parent
+REPOSITORY = HERE.parent
+
+FOR_EVERY_BACKEND = ("backends", "compilers", "smoke")
+"""Markers of the tests that run on every backend."""
+
+FILES = pytest.StashKey[list[pytest.Module]]()
+"""With --queue, the files of tests, before they are imported."""
 
 # Kernels compile inside the first example and machines are shared: nothing here is held to a time.
 UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,6 +59,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    tests_have_names = any("::" in argument for argument in config.args)
+    if config.getoption("--queue") and not config.option.collectonly and not tests_have_names:
+        config.stash[FILES] = []
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m` and names of markers alone, files that have none of them are not even imported."""
+    every = "" if config.getoption("--arch") == "cpu" else " or ".join(FOR_EVERY_BACKEND)
+    chosen: str = config.option.markexpr or every
+    if collection_path.suffix != ".py" or not re.fullmatch(r"\w+( or \w+)*", chosen):
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return None if any(f"mark.{name}" in text for name in chosen.split(" or ")) else True
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if "soak" not in config.option.markexpr:
         soak = [item for item in items if item.get_closest_marker("soak")]
@@ -72,12 +96,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             _take_fewer_examples(item)
 
 
+def pytest_make_collect_report(collector: pytest.Collector) -> pytest.CollectReport | None:
+    """With --queue, a file is imported by the process that takes it."""
+    if not isinstance(collector, pytest.Module) or FILES not in collector.config.stash:
+        return None
+    collector.config.stash[FILES].append(collector)
+    return pytest.CollectReport(collector.nodeid, "passed", None, [])
+
+
 def pytest_runtestloop(session: pytest.Session) -> bool | None:
     """With --queue, take one file of tests after the other until none is left."""
-    folder: Path | None = session.config.getoption("--queue")
-    if folder is None or session.testsfailed or session.config.option.collectonly:
+    files = session.config.stash.get(FILES, None)
+    if files is None or session.testsfailed:
         return None  # pytest's own loop
-    tests = _taken_tests(folder, session.items)
+    del session.config.stash[FILES]
+    tests = _taken_tests(session, files)
     test = next(tests, None)
     while test is not None:
         following = next(tests, None)
@@ -87,42 +120,48 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
         if session.shouldstop:
             raise session.Interrupted(session.shouldstop)
         test = following
+    session.testscollected = len(files)  # 0, as before they were imported, is an error to pytest
     return True
 
 
-def _taken_tests(queue: Path, items: list[pytest.Item]) -> Iterator[pytest.Item]:
+def _taken_tests(session: pytest.Session, files: list[pytest.Module]) -> Iterator[pytest.Item]:
     """The tests of the files that this process is the first to take. It takes those of a folder together,
     because they use the same kernels, which each process compiles; at the end it helps with the folders of
-    others. Large ones come first, so that all processes end at about the same time."""
-    files: dict[Path, list[pytest.Item]] = {}
-    for item in items:
-        files.setdefault(item.path, []).append(item)
-    paths = sorted(files, key=lambda path: path.stat().st_size, reverse=True)
-    folders: dict[Path, list[Path]] = {}
-    for path in paths:
-        folders.setdefault(path.parent, []).append(path)
-    sizes = {folder: sum(path.stat().st_size for path in inside) for folder, inside in folders.items()}
-    for folder in sorted(folders, key=sizes.__getitem__, reverse=True):
-        if _is_first(queue, folder):
-            for path in folders[folder]:
-                if _is_first(queue, path):
-                    yield from files[path]
-    for path in paths:
-        if _is_first(queue, path):
-            yield from files[path]
+    others. Large ones come first, after those of no folder, which are slow, so that all processes end at
+    about the same time."""
+    files = sorted(files, key=lambda file: file.path.stat().st_size, reverse=True)
+    folders: dict[Path, list[pytest.Module]] = {}
+    for file in files:
+        folders.setdefault(file.path.parent, []).append(file)
+    sizes = {folder: sum(file.path.stat().st_size for file in inside) for folder, inside in folders.items()}
+    for folder in sorted(folders, key=lambda folder: (folder != HERE, -sizes[folder])):
+        if _is_first(session.config, folder):
+            for file in folders[folder]:
+                yield from _its_tests(session, file)
+    for file in files:
+        yield from _its_tests(session, file)
 
 
-def _is_first(queue: Path, path: Path) -> bool:
+def _its_tests(session: pytest.Session, file: pytest.Module) -> list[pytest.Item]:
+    """The tests of a file, none if another process has taken it."""
+    if not _is_first(session.config, file.path):
+        return []
+    items = list(session.genitems(file))
+    session.config.hook.pytest_collection_modifyitems(session=session, config=session.config, items=items)
+    return items
+
+
+def _is_first(config: pytest.Config, path: Path) -> bool:
     """Whether this process is the first to take a file or folder of tests."""
     try:
-        (queue / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
+        (config.getoption("--queue") / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
     except FileExistsError:
         return False
     return True
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:
-    marked = any(item.get_closest_marker(name) for name in ("backends", "compilers", "smoke"))
+    marked = any(item.get_closest_marker(name) for name in FOR_EVERY_BACKEND)
     return marked and _uses(item, "backend") and not _uses(item, "one_backend")
 
 
