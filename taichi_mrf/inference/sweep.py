@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +13,22 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits, RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
+
+if TYPE_CHECKING:
+    from taichi_mrf.inference import no_returns
+else:
+    (no_returns,) = later("taichi_mrf.inference", "no_returns")
 
 TRACE_BYTES = 20
 """Bytes of one step of a ray in the trace."""
@@ -116,13 +122,13 @@ class Sweeper:
             # Step 4, forward, eqs. 4 and 11, and step 5, backward, eqs. 13 and 14: each ray's messages.
             if keyframe.no_returns is not None:
                 parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers)
-                send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
+                no_returns.send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
             sum_product.send_messages(
                 keyframe.ray_list, 0.0, keyframe.image.sensor,
                 cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
             )  # fmt: skip
             if keyframe.no_returns is not None:
-                take_where_unmeasured(
+                no_returns.take_where_unmeasured(
                     len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
                     cast.swept.scale, limits.length,
                 )  # fmt: skip

@@ -12,16 +12,19 @@ from taichi_mrf.inference.incremental import change_count_seen_by
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, NoReturnRays, RayList
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
-from taichi_mrf.inference.no_returns import no_return_rays
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.later import later
 from taichi_mrf.voxels.numbering import strip_length
 
 if TYPE_CHECKING:
+    from taichi_mrf.inference import no_returns
     from taichi_mrf.inference.dated import DatedBelief
+else:
+    (no_returns,) = later("taichi_mrf.inference", "no_returns")
 
 SCOUTS = 4
 """One of this many neighbouring rays is followed through free space to find the crossed bricks."""
@@ -45,8 +48,10 @@ class KeyframeAllocator:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
         CapacityError if there is not enough memory."""
         # A ray stands for each block of pixels that say the same: one factor psi_r each, eq. 4.
-        rays, no_returns = self.bundler.rays_of(image), no_return_rays(image, self.sensor, self.bundler)
-        return self._placed(id, name, image, rays, T_world_camera, stamp_s, no_returns)
+        rays, without = self.bundler.rays_of(image), None
+        if image.own.no_return is not None:
+            without = no_returns.no_return_rays(image, self.sensor, self.bundler)
+        return self._placed(id, name, image, rays, T_world_camera, stamp_s, without)
 
     def place_again(self, keyframe: Keyframe, image: DepthImage, T_world_camera: Pose) -> Keyframe:
         """Place a keyframe at another pose, after :meth:`take_out`. Its rays stay the same if its image does.
@@ -65,7 +70,7 @@ class KeyframeAllocator:
         parts = (self.registry.voxel_size, self.sensor, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
         of_no_returns = 0 if no_returns is None else no_returns.nbytes
-        self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes + of_no_returns)
+        self.budget.check(footprint, image.nbytes + rays.nbytes + of_no_returns)
         self.registry.anchor_at(T_world_camera[:3, 3])
         return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint, no_returns)
 
