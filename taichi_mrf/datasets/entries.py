@@ -2,7 +2,7 @@
 
 A format's reader is a module that is named here and imported when a source of that format is opened. The
 first entry that recognises a folder or a file opens it, even if some of its files are missing or damaged:
-opening reports them. Formats of other packages, and those that few have, are plugs (plugs.py).
+opening reports them. Formats of other packages, and those that few have, are plugs (registry.py).
 """
 
 import re
@@ -187,7 +187,9 @@ BUILT_IN: dict[str, BuiltIn] = {
             when_called(f"{HERE}.synthetic.corridor:open_synthetic_corridor"),
             rendered=True,
         ),
-        BuiltIn("synthetic:ring", when_called(f"{HERE}.synthetic.ring:open_synthetic_ring"), rendered=True),
+        BuiltIn(
+            "synthetic:ring", when_called(f"{HERE}.synthetic.corridor:open_synthetic_ring"), rendered=True
+        ),
         BuiltIn("mesh:", when_called(f"{HERE}.synthetic.mesh_sequence:open_mesh")),
         BuiltIn(REALSENSE, when_called(f"{HERE}.realsense.device:open_realsense")),
     )

@@ -1,4 +1,5 @@
-"""Formats that few have: plugs (plugs.py) of this package, declared in pyproject.toml as another's would be.
+"""Formats that few have: plugs (registry.py) of this package, declared in pyproject.toml as another's would
+be.
 
 What tells that a source is one is here; the readers are imported when such a source is opened.
 """

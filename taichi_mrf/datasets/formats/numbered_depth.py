@@ -31,12 +31,12 @@ from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera, own_cameras
 from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
     RecordedPose,
     Trajectory,
+    in_seconds,
     is_trajectory,
     poses_at_start,
     read_trajectory,

@@ -18,7 +18,6 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import stamps_a_second
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import (
@@ -27,6 +26,7 @@ from taichi_mrf.datasets.trajectories import (
     is_trajectory,
     poses_at_start,
     read_trajectory,
+    stamps_a_second,
 )
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.lidar.las_file import read_timed_las
-from taichi_mrf.datasets.lidar.scan_poses import TEXTS
+from taichi_mrf.datasets.lidar.scan_folder import TEXTS
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap, read_timed_poses, within_gap

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from taichi_mrf.datasets.base import when_called
 from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind, PoseSource
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind, PoseSource, WatchedFile
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
-from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.ros.names import METADATA, is_bag
 from taichi_mrf.datasets.ros.names import SUFFIXES as BAGS
 from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory, valid_poses

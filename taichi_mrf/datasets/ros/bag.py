@@ -24,12 +24,16 @@ from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.beside import (
+    BagColors,
+    BagConfidence,
+    BagImu,
+    find_colors,
+    find_confidence,
+    find_imu,
+)
 from taichi_mrf.datasets.ros.cameras import BagCameras, find_cameras
-from taichi_mrf.datasets.ros.color import BagColors, find_colors
-from taichi_mrf.datasets.ros.confidence import BagConfidence, find_confidence
-from taichi_mrf.datasets.ros.imu import BagImu, find_imu
-from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
+from taichi_mrf.datasets.ros.lidar import POINT_CLOUD, LidarBag
 from taichi_mrf.datasets.ros.poses import PoseChoice
 from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import find_sensor, posed_by, poses_of

@@ -24,7 +24,7 @@ from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
-from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
+from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     FROM_TF,
     choose,
@@ -33,7 +33,6 @@ from taichi_mrf.datasets.ros.topics import (
     message_frame,
     path_topics,
 )
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import as_pose

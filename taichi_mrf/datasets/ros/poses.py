@@ -22,9 +22,8 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
-from taichi_mrf.datasets.ros.tf import alternates
+from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, path_topics, pose_topics
-from taichi_mrf.datasets.ros.transform_tree import WORLDS, TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose

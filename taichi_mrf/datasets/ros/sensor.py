@@ -11,8 +11,7 @@ from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
-from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose

@@ -7,9 +7,8 @@ from pathlib import Path
 from taichi_mrf.datasets.ros.bag import REALSENSE
 from taichi_mrf.datasets.ros.poses import pose_candidates
 from taichi_mrf.datasets.ros.reader import RosReader, Topic
-from taichi_mrf.datasets.ros.tf import Transforms, read_transforms, tree_of
+from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import DepthTopic, cloud_topics, depth_topics, message_frame
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.lidar import POINT_CLOUD
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.errors import DatasetError
 

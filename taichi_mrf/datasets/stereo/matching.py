@@ -79,7 +79,7 @@ class StereoMatching:
     least_disparity: the relative error of depth is sigma_d / disparity, and the sky's is near 0."""
 
     pixel_sigma: bool = True
-    """True if frames state a sigma for each pixel, by how sure the matching is of it (stereo/confidence.py).
+    """True if frames state a sigma for each pixel, by how sure the matching is of it (stereo/pairs.py).
     Otherwise sigma follows from depth alone, with one sigma_d for all pixels."""
 
     def __post_init__(self) -> None:
