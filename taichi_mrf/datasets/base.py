@@ -180,6 +180,13 @@ class Row:
     pose_source: str
 
 
+@dataclass(frozen=True)
+class NumberedRow(Row):
+    """A frame, and its number in the recording."""
+
+    number: int
+
+
 AnyRow = TypeVar("AnyRow", bound=Row)
 
 

@@ -19,10 +19,9 @@ from typing import Any
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
+from taichi_mrf.datasets.derived import mended, resampled
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
-from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros.names import is_bag
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole

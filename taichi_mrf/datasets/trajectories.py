@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import start_pose
-from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -197,6 +196,9 @@ def _number(word: str) -> float:
 
 Layout = Literal["stamped", "rows", "log"]
 
+TEXTS = (".txt", ".log", ".tum", ".csv", ".freiburg")
+"""Endings of such files."""
+
 OTHERWISE = "--poses FILE takes them from elsewhere, --track-poses finds them"
 """Remedy for a recording without poses."""
 
@@ -260,13 +262,16 @@ def read_trajectory(path: Path) -> Trajectory:
                 stacklevel=2,
             )
         rate = stamps_a_second([values[0] for _, values in known])
-        poses = _longest_run(path, tuple(_stamped(path, line, rate) for line in known))
+        stamped = (_pose(path, line, (8, 13, 17)) for line in known)
+        poses = _longest_run(path, tuple(replace(pose, key=pose.key / rate) for pose in stamped))
         _warn_of_twice(path, poses)
         return Trajectory(path, "stamped", poses)
     if matrices:  # KITTI-360: the frame's number, and the matrix
-        return Trajectory(path, "log", tuple(_numbered(path, line) for line in lines))
+        return Trajectory(path, "log", tuple(_pose(path, line, (13, 17)) for line in lines))
     if columns in (7, 12, 16):
-        return Trajectory(path, "rows", tuple(_row(path, i, line) for i, line in enumerate(lines)))
+        return Trajectory(
+            path, "rows", tuple(_pose(path, line, (12, 7, 16), i) for i, line in enumerate(lines))
+        )
     if columns == 3:
         blocks = (lines[i : i + 5] for i in range(0, len(lines), 5))
         return Trajectory(path, "log", tuple(_log_block(path, block) for block in blocks))
@@ -275,6 +280,23 @@ def read_trajectory(path: Path) -> Trajectory:
         "stamp), 12 or 16 (a matrix), 13 or 17 (its number and a matrix), or 3 (the head of a .log block); "
         "a first line such as 'stamp,tx,ty,tz,qw,qx,qy,qz' may name other columns"
     )
+
+
+RESTART_S = 1.0
+"""A clock that goes back by more than this starts again; by less, messages came out of order."""
+
+
+def starts_of_runs(stamps: Sequence[float] | NDArray[np.float64]) -> list[int]:
+    """The indices at which runs begin, the first 0, of stamps (seconds) in the order of recording. A single
+    stamp that is off, between two that follow each other, begins none."""
+    s = np.asarray(stamps, np.float64)
+    back: list[int] = (np.flatnonzero(s[1:] < s[:-1] - RESTART_S) + 1).tolist()
+    return [0] * bool(len(s)) + [i for i in back if not (_is_off(s, i - 1) or _is_off(s, i))]
+
+
+def _is_off(stamps: NDArray[np.float64], i: int) -> bool:
+    """True if the stamp after this one follows the one before it."""
+    return bool(0 < i < len(stamps) - 1 and stamps[i + 1] > stamps[i - 1])
 
 
 _SHORTEST_RUN = 5
@@ -385,32 +407,21 @@ def rotation_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def _stamped(path: Path, line: Line, rate: float) -> RecordedPose:
+def _pose(path: Path, line: Line, counts: tuple[int, ...], key: float | None = None) -> RecordedPose:
+    """The pose in a line of one of these numbers of numbers, behind its key unless that is given."""
     number, values = line
-    if len(values) in (13, 17):
-        return replace(_numbered(path, line), key=values[0] / rate)
-    _expect(path, line, 8)
-    return RecordedPose(values[0] / rate, np.array(values[1:], float), f"{path} line {number}")
+    if len(values) not in counts:
+        _expect(path, line, counts[0])
+    pose = np.array(values[1:] if key is None else values, float)
+    where = f"{path} line {number}"
+    return RecordedPose(
+        values[0] if key is None else key, pose if len(pose) == 7 else pose.reshape(-1, 4), where
+    )
 
 
 def _are_stamps(keys: Sequence[float]) -> bool:
     """True if the numbers before matrices are times since 1970, as MulRan has them, or have fractions."""
     return stamps_a_second(keys) != 1 or any(key % 1 for key in keys if np.isfinite(key))
-
-
-def _row(path: Path, index: int, line: Line) -> RecordedPose:
-    number, values = line
-    if len(values) not in (7, 12, 16):
-        _expect(path, line, 12)
-    pose = np.array(values, float)
-    return RecordedPose(index, pose if len(pose) == 7 else pose.reshape(-1, 4), f"{path} line {number}")
-
-
-def _numbered(path: Path, line: Line) -> RecordedPose:
-    number, values = line
-    if len(values) not in (13, 17):
-        _expect(path, line, 13)
-    return RecordedPose(values[0], np.reshape(values[1:], (-1, 4)).astype(float), f"{path} line {number}")
 
 
 def _warn_of_twice(path: Path, poses: tuple[RecordedPose, ...]) -> None:

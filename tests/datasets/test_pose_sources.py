@@ -20,10 +20,10 @@ from taichi_mrf.datasets.pose_sources.base import (
     CallbackPoses,
     ChangedPoses,
     WatchedFile,
+    open_pose_source,
 )
 from taichi_mrf.datasets.pose_sources.graph_file import PoseGraph, read_pose_graph, write_pose_graph
 from taichi_mrf.datasets.pose_sources.posed import FramePoses, open_posed, posed_by
-from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose

@@ -14,9 +14,9 @@ from rtabmap_database import OPTICAL, Database, calibration, encoded, plain_cali
 from scipy.spatial.transform import Rotation
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.formats.rtabmap import RtabmapDatabase, decode_depth, node_camera
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.registry import format_name
-from taichi_mrf.datasets.rtabmap.recording import RtabmapDatabase, decode_depth, node_camera
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table, start_pose
+from taichi_mrf.datasets.base import NumberedRow, Table, start_pose
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.images import decode_color
@@ -286,15 +286,8 @@ _MOST_DIGITS = 9
 _ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True)
-class Record3DFrame(Row):
-    """A frame and its number."""
-
-    number: int
-
-
 @dataclass
-class Record3D(Table[Record3DFrame]):
+class Record3D(Table[NumberedRow]):
     """The frames of a recording. ``cameras`` are those of their colour images, where
     each has its own; None if one holds for all, as the caller's does."""
 
@@ -305,7 +298,7 @@ class Record3D(Table[Record3DFrame]):
     steps_per_metre: float = 1.0
     color: bool = True
 
-    def load(self, index: int, row: Record3DFrame, T_world_camera: Pose) -> Frame:
+    def load(self, index: int, row: NumberedRow, T_world_camera: Pose) -> Frame:
         """Read depth, confidence and colour, which must have the sizes that they should."""
         number, own = row.number, None if self.cameras is None else self.cameras[index]
         camera = self.camera if own is None else _of_depth(own, self.camera.shape)
@@ -389,9 +382,9 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
     )
 
 
-def _row(metadata: Metadata, number: int, stamp: float) -> Record3DFrame:
+def _row(metadata: Metadata, number: int, stamp: float) -> NumberedRow:
     pose = partial(_pose, metadata.poses[number]) if metadata.has_poses else start_pose()
-    return Record3DFrame(f"{number:06d}", stamp, pose, f"{metadata.where}: pose {number}", number)
+    return NumberedRow(f"{number:06d}", stamp, pose, f"{metadata.where}: pose {number}", number)
 
 
 def _pose(values: NDArray[np.float64]) -> Pose:

@@ -3,7 +3,7 @@
 The fields of :class:`OusterOptions` are the options. Poses are those in the recording (OSF files that a SLAM
 has written have one for each column) or in a file of ``stamp tx ty tz qx qy qz qw`` lines, by the stamps of
 the sensor; without either the sensor is assumed to stand still. A scan is an image of beams and columns; if
-the sensor moved meanwhile, each column has a pose of its own (motion.py). Reading needs the extra ``ouster``.
+the sensor moved meanwhile, each column has a pose of its own (scans.py). Reading needs the extra ``ouster``.
 
 ouster-sdk trusts what is in a file, and wrong sizes end the process, so the file is checked first. An OSF is
 a row of blocks: a header, chunks of messages, and metadata. Each is its size in 4 bytes, a FlatBuffer of that
@@ -20,15 +20,22 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table
-from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
-from taichi_mrf.datasets.lidar.scans import LidarRecording, reach_of, refuse_image_options
+from taichi_mrf.datasets.base import NumberedRow, Table
+from taichi_mrf.datasets.lidar.scans import (
+    LidarRecording,
+    Motion,
+    PoseAt,
+    Scan,
+    reach_of,
+    refuse_image_options,
+)
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import (
     INTERPOLATION_GAP,
@@ -209,15 +216,8 @@ class OusterOptions:
     """Give each column of a scan the sensor's pose at its time."""
 
 
-@dataclass(frozen=True)
-class RecordedColumns(Row):
-    """A scan, stamped in the middle of its columns, and its number in the source."""
-
-    number: int
-
-
 @dataclass
-class OusterScans(LidarRecording, Table[RecordedColumns]):
+class OusterScans(LidarRecording, Table[NumberedRow]):
     """The scans of one sensor. ``source`` is ouster.sdk's; ``trajectory`` are poses of the sensor,
     T_world_sensor, from a file, None for those in the recording."""
 
@@ -229,7 +229,7 @@ class OusterScans(LidarRecording, Table[RecordedColumns]):
     gap: float = INTERPOLATION_GAP
     deskew: bool = True
 
-    def load(self, index: int, row: RecordedColumns, T_world_camera: Pose) -> Frame:
+    def load(self, index: int, row: NumberedRow, T_world_camera: Pose) -> Frame:
         """Decode one scan, which must have a column."""
         with naming(self.path):
             columns = columns_of(self.source, row.number, self.sensor)
@@ -310,7 +310,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     gap = largest_gap(options)
     source, count = _open(path, chosen)
     beams = _beams(path, source, chosen.sensor)
-    scans: list[RecordedColumns] = []
+    scans: list[NumberedRow] = []
     at: list[Pose | None] = []
     ends: list[Pose] = []
     reach_m = None
@@ -325,7 +325,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         stamp = 0.5 * (first + last)
         at.append(np.eye(4) if tracked else _poses(columns, trajectory, gap)(stamp))
         pose = partial(_pose, path, at[-1], beams.T_sensor_lidar)
-        scans.append(RecordedColumns(f"{number:06d}", stamp, pose, str(path), number))
+        scans.append(NumberedRow(f"{number:06d}", stamp, pose, str(path), number))
         ends += [columns.poses.poses[0], columns.poses.poses[-1]]
         if reach_m is None and at[-1] is not None and columns.range_m.any():
             reach_m = reach_of(columns.range_m)
@@ -380,4 +380,4 @@ def _beams(path: Path, source: Any, sensor: int) -> Beams:
 
 def _of_sensor(frames: Any, sensor: int) -> Any | None:
     """The scan of one sensor in what the source gives at a time."""
-    return next(iter([frame for i, frame in enumerate(frames) if i == sensor]), None)
+    return next(islice(frames, sensor, None), None)

@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import Conventions
+from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.hints import unread_poses
 from taichi_mrf.datasets.lidar.clouds import (
@@ -30,20 +30,18 @@ from taichi_mrf.datasets.lidar.clouds import (
     read_cloud,
     read_pcd_header,
 )
-from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, of_sensor
+from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
-from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import ReadOptions, parse_options
-from taichi_mrf.datasets.stereo.pairs import read_times
-from taichi_mrf.datasets.timed_poses import largest_gap, read_timed_poses, within_gap
-from taichi_mrf.datasets.trajectories import in_seconds, is_trajectory, read_trajectory
+from taichi_mrf.datasets.stereo.matching import read_times
+from taichi_mrf.datasets.timed_poses import read_timed_poses
+from taichi_mrf.datasets.trajectories import TEXTS, in_seconds, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.system.files import is_file, is_folder
 from taichi_mrf.system.npz_file import open_npz
 
 POSES_NPZ = "poses.npz"
-TEXTS = (".txt", ".log", ".tum", ".csv", ".freiburg")
 _MATRICES = ("T_world_lidar", "T_world_sensor", "T_world_camera")
 
 
@@ -179,10 +177,8 @@ def _stamp_of(cloud: Path) -> float | None:
 
 def _at_stamps(path: Path, stamps: dict[Path, float], options: ReadOptions) -> dict[Path, ScanPose]:
     """Each scan's pose, interpolated at its time, for those that have neighbours near enough."""
-    timed, gap, clouds = read_timed_poses(path), largest_gap(options), list(stamps)
-    at = [timed.at(stamp, gap) for stamp in stamps.values()]
-    where = str(path)
-    posed, _ = within_gap(list(stamps.values()), at, gap, "scans", where, "by their names", timed.stamps)
+    timed, where, clouds = read_timed_poses(path), str(path), list(stamps)
+    posed, _ = timed.posed(list(stamps.values()), options, "scans", where, "by their names")
     return {clouds[i]: ScanPose(stamps[clouds[i]], partial(as_pose, pose), where) for i, pose in posed}
 
 
@@ -244,7 +240,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
             pose.stamp,
             pose.read,
             pose.source,
-            partial(_points, cloud, world, options.conventions),
+            partial(read_of_sensor, partial(read_cloud, cloud), world, options.conventions),
             str(cloud),
         )
         for cloud in posed
@@ -338,9 +334,3 @@ def _frame_of(
         f"points are in the {frames[0]}'s frame: clouds fit together {why}; rays begin at the sensor's "
         f"poses. ?points={frames[1]} takes them for the {frames[1]}'s"
     ]
-
-
-def _points(cloud: Path, world: bool, conventions: Conventions, T_recorded: Pose) -> NDArray[np.float64]:
-    """The points of a file in the sensor's frame, into which those of the ``world``'s are taken."""
-    points_m = read_cloud(cloud)
-    return of_sensor(points_m, pose_of(T_recorded, conventions)) if world else points_m

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from taichi_mrf.config.arguments import real
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
-from taichi_mrf.datasets.derived import Chosen
-from taichi_mrf.datasets.mended import moved_note, origin_of, pose_of, stated_origin
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile
+from taichi_mrf.datasets.derived import Chosen, moved_note, origin_of, pose_of, stated_origin
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile, open_pose_source
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, check_unit
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, collected_warnings, naming
@@ -317,9 +316,6 @@ def open_posed(
             source, track=track, max_time_gap=max_time_gap, poses_are=poses_are, mounting=mounting, **reading
         )
     conventions = conventions_of(poses_are, mounting, AXIAL)
-    # Imported late: no recording that brings its own poses needs it.
-    from taichi_mrf.datasets.pose_sources.registry import open_pose_source
-
     opened = open_pose_source(poses)
     keywords = {"max_time_gap": max_time_gap, **reading}
     has_poses = True

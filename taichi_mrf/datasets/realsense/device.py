@@ -18,7 +18,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Row, Table, start_pose
+from taichi_mrf.datasets.base import Dataset, NumberedRow, Table, start_pose
 from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
@@ -60,6 +60,12 @@ def aligned_images(frames: Any, align: Any) -> tuple[Any, NDArray[np.uint8] | No
     both = align.process(frames)
     depth, color = both.get_depth_frame(), both.get_color_frame()
     return depth, np.array(color.get_data(), np.uint8) if color else None
+
+
+def _camera_of(depth: Any) -> PinholeCamera:
+    """The camera of a stream of depth."""
+    k = depth.as_video_stream_profile().get_intrinsics()
+    return PinholeCamera(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
 
 
 class Player:
@@ -114,23 +120,15 @@ class Player:
             resolved = config.resolve(rs.pipeline_wrapper(pipeline))
             resolved.get_device().as_playback().set_real_time(False)
             profile = pipeline.start(config)
-            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+            self.camera = _camera_of(profile.get_stream(rs.stream.depth))
             self.depth_scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
         except RuntimeError as error:
             raise DatasetError(f"{self._path}: cannot be played: {' '.join(str(error).split())}") from error
-        self.camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
         self._pipeline = pipeline
 
 
-@dataclass(frozen=True)
-class RealSenseFrame(Row):
-    """A frame, and the number that the camera gave its image."""
-
-    number: int
-
-
 @dataclass
-class RealSenseRecording(Table[RealSenseFrame]):
+class RealSenseRecording(Table[NumberedRow]):
     """The depth images of a recording, and what its IMU measured."""
 
     player: Player = field(kw_only=True)
@@ -143,7 +141,7 @@ class RealSenseRecording(Table[RealSenseFrame]):
         self._last = -1
         """The index of the frame that was read last; the player stands behind it."""
 
-    def load(self, index: int, row: RealSenseFrame, T_world_camera: Pose) -> Frame:
+    def load(self, index: int, row: NumberedRow, T_world_camera: Pose) -> Frame:
         """Play on to an image, from the beginning if it lies behind."""
         if index <= self._last:
             self.player.rewind()
@@ -339,11 +337,9 @@ def _open_camera(
     if with_imu:
         motion, said = motion_or_note(MotionModule, rs, profile.get_device(), depth)
         notes += said
-    stream = depth.as_video_stream_profile().get_intrinsics()
-    camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
     source = RealSenseCamera(
         REALSENSE,
-        options.camera or camera,
+        options.camera or _camera_of(depth),
         notes=notes,
         pipeline=pipeline,
         align=align,
@@ -399,7 +395,7 @@ def _open_recording(
         dropped=len(images) - len(posed),
         player=player,
         rows=[
-            RealSenseFrame(f"realsense-{each.number:06d}", each.stamp, pose, str(path), each.number)
+            NumberedRow(f"realsense-{each.number:06d}", each.stamp, pose, str(path), each.number)
             for each, pose in ((images[i], pose) for i, pose in posed)
         ],
         gyro=gyro,

@@ -7,8 +7,9 @@ byte, 0, 16, ... to 240; 0 to 15 are read too. The gyroscope of an IMU tells how
 accelerometer which way is up at the beginning.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import cv2
@@ -19,11 +20,10 @@ from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.cameras import camera_of
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.datasets.ros.sensor import BagSensor
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics
+from taichi_mrf.datasets.ros.sensor import BagSensor, camera_of
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics, topics_of
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples, upwards_at
@@ -35,41 +35,39 @@ _BITS = 4
 
 
 @dataclass(frozen=True)
-class BagConfidence:
-    """The images of one topic: ``entries`` has the one that belongs to each depth image, or None."""
+class Beside:
+    """The images of one topic: ``entries`` has the one that belongs to each depth image, or None. ``decode``
+    brings a message to the pixels of a depth image (H, W) of a camera."""
 
     reader: RosReader
     topic: str
     entries: Sequence[Entry | None]
+    decode: Callable[[Any, NDArray[np.float32], PinholeCamera], NDArray[Any]]
 
-    def read(
-        self, index: int, depth_m: NDArray[np.float32], camera: PinholeCamera
-    ) -> NDArray[np.float32] | None:
-        """The sigma of a depth image's pixels, (H, W) metres, None if it has no confidence. Raises
-        DatasetError, which names file and topic."""
+    def read(self, index: int, depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[Any] | None:
+        """Colours or sigmas of a depth image's pixels, None if it has none. Raises DatasetError, which names
+        file and topic."""
         entry = self.entries[index]
         if entry is None:
             return None
         message = self.reader.read(self.topic, entry)
         with naming(f"{self.reader.path}: topic {self.topic}"):
-            return L515.sigma_m(_grades(messages.grey_image(message)), depth_m, camera)
+            return self.decode(message, depth_m, camera)
 
 
 def find_confidence(
-    reader: RosReader,
+    sensor: BagSensor,
     wanted: str,
     depth: DepthTopic,
     camera: PinholeCamera,
     stamps: Sequence[float],
     gap: float | None,
-    sensor: BagSensor,
-) -> tuple[BagConfidence | None, list[str]]:
+) -> tuple[Beside | None, list[str]]:
     """The confidence of depth images of some stamps, and notes for the user: which topic is used, how many
     depth images have none, and why none is used although there is one. ``wanted`` is the topic, if the user
     named it. Raises DatasetError if that is none of the depth image's confidence."""
-    images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
-    names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    beside = [name for name in names if _beside(name, depth.name)]
+    reader = sensor.reader
+    beside = [name for name in topics_of(reader, *messages.IMAGES) if _beside(name, depth.name)]
     if wanted:
         name = choose(reader, "confidence", wanted, beside, "topics of confidence")
         problem = _misfit(reader, name, camera)
@@ -86,7 +84,7 @@ def find_confidence(
     if len(sensor.frames) > 1:
         return None, [f"confidence: {name} is not used: depth is of several sensors"]
     entries, alone = paired(sensor, name, stamps, gap)
-    return BagConfidence(reader, name, entries), [f"confidence: {name}, as a sigma for each pixel{alone}"]
+    return Beside(reader, name, entries, _sigma_m), [f"confidence: {name}, as a sigma for each pixel{alone}"]
 
 
 def _beside(name: str, depth: str) -> bool:
@@ -108,6 +106,11 @@ def _misfit(reader: RosReader, name: str, camera: PinholeCamera) -> str | None:
     if (height, width) == camera.shape:
         return None
     return f"its images have {width} x {height} pixels, those of depth {camera.width} x {camera.height}"
+
+
+def _sigma_m(message: Any, depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[np.float32]:
+    """The sigma of a depth image's pixels, (H, W) metres, by a message with their grades."""
+    return L515.sigma_m(_grades(messages.grey_image(message)), depth_m, camera)
 
 
 def _grades(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -137,14 +140,14 @@ class BagImu:
     notes: list[str] = field(default_factory=list)
 
 
-def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) -> BagImu:
+def find_imu(sensor: BagSensor, wanted: str, first_s: float) -> BagImu:
     """The IMU beside a camera whose images begin at ``first_s``. ``wanted`` is the topic, if the user
     named it. Raises DatasetError if that has no angular rates."""
     if wanted == NONE:
         return BagImu()
-    topics = [
-        t.name for t in reader.topics.values() if t.type == messages.IMU and _turns(reader.first(t.name))
-    ]
+    reader = sensor.reader
+    found = topics_of(reader, messages.IMU)
+    topics = [name for name in found if _measures(reader.first(name), "angular_velocity")]
     if not wanted and len(topics) != 1:
         return BagImu(notes=[f"imu: choose one with ?imu={' or ?imu='.join(topics)}"] if topics else [])
     name = choose(reader, "imu", wanted, topics, "topics of an IMU's angular rates")
@@ -155,7 +158,8 @@ def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) 
         rate, force = message.angular_velocity, message.linear_acceleration
         entries.append(entry)
         rates.append((rate.x, rate.y, rate.z))
-        accelerations.append((force.x, force.y, force.z) if _accelerates(message) else (np.nan,) * 3)
+        felt = _measures(message, "linear_acceleration")
+        accelerations.append((force.x, force.y, force.z) if felt else (np.nan,) * 3)
         frame = frame or entry.frame
     T_optical_imu = np.eye(4) if frame == optical != "" else sensor.tree().mounted(optical, frame)
     if T_optical_imu is None:
@@ -167,77 +171,59 @@ def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) 
     rates_imu = np.array(rates)[part][first]
     valid = np.isfinite(rates_imu).all(axis=1)
     measured = np.array(accelerations)[part][first] @ to_optical
-    felt = np.isfinite(measured).all(axis=1)
-    acceleration = AccelerationSamples(times[felt], measured[felt], T_optical_imu[:3, 3])
+    known = np.isfinite(measured).all(axis=1)
+    acceleration = AccelerationSamples(times[known], measured[known], T_optical_imu[:3, 3])
     up = upwards_at(acceleration, first_s)
     level = "the first image is level by it" if up is not None else "which way is up it does not say"
     gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
-    return BagImu(gyro, acceleration if felt.any() else None, up, [f"imu: {name} measures turns; {level}"])
+    return BagImu(gyro, acceleration if known.any() else None, up, [f"imu: {name} measures turns; {level}"])
 
 
-def _turns(message: Any | None) -> bool:
-    """True if a message has angular rates: the first covariance is -1 if it has none."""
-    return message is not None and message.angular_velocity_covariance[0] != -1
-
-
-def _accelerates(message: Any) -> bool:
-    """The same for accelerations."""
-    return bool(message.linear_acceleration_covariance[0] != -1)
+def _measures(message: Any | None, what: str) -> bool:
+    """True if a message has angular rates or accelerations: their first covariance is -1 if it has none."""
+    return message is not None and getattr(message, f"{what}_covariance")[0] != -1
 
 
 COLOR_GAP = 0.035
 """Default of the largest time in seconds between a depth image and its colour image: a frame at 30 Hz."""
 
 
-@dataclass(frozen=True)
-class BagColors:
-    """The colour images of one topic: ``entries`` has the one that belongs to each depth image, or None.
-    ``camera`` took them unless they are registered to depth; ``distortion`` are its OpenCV coefficients."""
-
-    reader: RosReader
-    topic: str
-    entries: Sequence[Entry | None]
-    camera: ColorCamera | None
-    distortion: tuple[float, ...]
-
-    def read(
-        self, index: int, depth_m: NDArray[np.float32], depth_camera: PinholeCamera
-    ) -> NDArray[np.uint8] | None:
-        """The colours (H, W, 3) of a depth image's pixels, None if it has none. Raises DatasetError, which
-        names file and topic."""
-        entry = self.entries[index]
-        if entry is None:
-            return None
-        message = self.reader.read(self.topic, entry)
-        with naming(f"{self.reader.path}: topic {self.topic}"):
-            color = messages.color_image(message)
-        own = depth_camera if self.camera is None else self.camera.camera
-        if color.shape[:2] != own.shape:
-            raise DatasetError(
-                f"{self.reader.path}: topic {self.topic}: the image has {color.shape[1]} x {color.shape[0]} "
-                f"pixels, its camera {own.width} x {own.height}"
-            )
-        if self.camera is None:
-            return without_black(color)
-        if any(self.distortion):
-            K = np.array([[own.fx, 0, own.cx], [0, own.fy, own.cy], [0, 0, 1.0]])
-            color = cv2.undistort(color, K, np.array(self.distortion)).astype(np.uint8)
-        return self.camera.registered(color, depth_m, depth_camera)
+def _colors(
+    of: ColorCamera | None,
+    distortion: tuple[float, ...],
+    message: Any,
+    depth_m: NDArray[np.float32],
+    depth_camera: PinholeCamera,
+) -> NDArray[np.uint8]:
+    """The colours (H, W, 3) of a depth image's pixels. The camera ``of`` them, whose OpenCV coefficients are
+    the ``distortion``, is None if they are registered to depth. Raises DatasetError for another size."""
+    color = messages.color_image(message)
+    own = depth_camera if of is None else of.camera
+    if color.shape[:2] != own.shape:
+        raise DatasetError(
+            f"the image has {color.shape[1]} x {color.shape[0]} pixels, its camera {own.width} x {own.height}"
+        )
+    if of is None:
+        return without_black(color)
+    if any(distortion):
+        K = np.array([[own.fx, 0, own.cx], [0, own.fy, own.cy], [0, 0, 1.0]])
+        color = cv2.undistort(color, K, np.array(distortion)).astype(np.uint8)
+    return of.registered(color, depth_m, depth_camera)
 
 
 def find_colors(
-    reader: RosReader,
+    sensor: BagSensor,
     wanted: str,
     depth: DepthTopic,
     camera: PinholeCamera,
     stamps: Sequence[float],
     gap: float | None,
-    sensor: BagSensor,
-) -> tuple[BagColors | None, list[str]]:
+) -> tuple[Beside | None, list[str]]:
     """The colours for depth images of some stamps, and notes for the user: which images are used, how many
     depth images have none, and why none are used although there are some. ``wanted`` is the topic, if the
     user named it. Raises DatasetError if that is no colour topic."""
-    topics = {topic.name: topic for topic in _color_topics(reader)}
+    reader = sensor.reader
+    topics = {topic.name: topic for topic in image_topics(reader) if messages.is_color(topic.encoding)}
     if not wanted and len(topics) != 1:
         return None, [f"color: choose one with ?color={' or ?color='.join(topics)}"] if topics else []
     name = choose(reader, "color", wanted, list(topics), "topics of colour images")
@@ -246,13 +232,12 @@ def find_colors(
         raise DatasetError(f"{reader.path}: topic {name}: encoding {topic.encoding!r} is not colour")
     if len(sensor.frames) > 1:
         return None, [f"color: {name} is not used: depth is of several sensors"]
-    found = _own_camera(reader, topic, depth, camera, sensor)
+    found = _own_camera(sensor, topic, depth, camera)
     if isinstance(found, str):
         return None, [f"color: {name} is not used: {found}"]
-    own, distortion = found
     entries, alone = paired(sensor, name, stamps, gap)
-    how = "registered to depth" if own is None else "brought to the depth camera's pixels"
-    return BagColors(reader, name, entries, own, distortion), [f"color: {name}, {how}{alone}"]
+    how = "registered to depth" if found[0] is None else "brought to the depth camera's pixels"
+    return Beside(reader, name, entries, partial(_colors, *found)), [f"color: {name}, {how}{alone}"]
 
 
 def paired(
@@ -266,15 +251,12 @@ def paired(
     return found, f"; {alone} of {len(found)} images have none" if alone else ""
 
 
-def _color_topics(reader: RosReader) -> list[DepthTopic]:
-    return [topic for topic in image_topics(reader) if messages.is_color(topic.encoding)]
-
-
 def _own_camera(
-    reader: RosReader, topic: DepthTopic, depth: DepthTopic, camera: PinholeCamera, sensor: BagSensor
+    sensor: BagSensor, topic: DepthTopic, depth: DepthTopic, camera: PinholeCamera
 ) -> tuple[ColorCamera | None, tuple[float, ...]] | str:
     """The camera of a topic of colour images beside the depth camera, None if the images are registered to
     depth, and its distortion; or why it is not known."""
+    reader = sensor.reader
     try:
         height, width = shape = messages.color_image(reader.first(topic.name)).shape[:2]
     except DatasetError as error:

@@ -17,15 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Table
-from taichi_mrf.datasets.lidar.motion import Motion, Scan
-from taichi_mrf.datasets.lidar.scans import LidarRecording, measured_points
+from taichi_mrf.datasets.lidar.scans import LidarRecording, Motion, Scan, measured_points
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 RINGS = ("ring", "channel", "laser_id", "line", "row")
 TIMES = ("t", "time", "timestamp", "offset_time", "time_stamp", "point_time_offset")
 

@@ -31,7 +31,7 @@ from taichi_mrf.datasets.ros.topics import (
     cloud_topics,
     depth_topics,
     message_frame,
-    path_topics,
+    topics_of,
 )
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
@@ -87,7 +87,7 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
     run = sensor.run if sensor else BagRun()
     tree = sensor.tree() if sensor else tree_of(read_transforms(reader), "", optical, choice.tf)
     tree = tree.towards(choice.frame, choice.body)
-    paths = path_topics(reader)
+    paths = topics_of(reader, messages.PATH)
     wanted = choice.pose
     if not wanted and len(paths) != 1:
         others = pose_candidates(reader, tree, optical) if optical else []

@@ -21,7 +21,8 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from types import SimpleNamespace
+from typing import Any, BinaryIO
 
 from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
@@ -37,16 +38,9 @@ _LEAST_FILE, _LARGEST_FILE_RATIO = 1 << 28, 100
 """A whole file, which is unpacked to the disk. Recordings pack three to twenty times."""
 
 
-class _Unpacker(Protocol):
-    @property
-    def eof(self) -> bool: ...
-
-    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
-
-
 def bound_unpacking() -> None:
     """Let rosbags unpack no more than a bound; to do so again changes nothing."""
-    unpackers: dict[str, Callable[[], _Unpacker]] = {
+    unpackers: dict[str, Callable[[], Any]] = {
         "bz2": bz2.BZ2Decompressor,
         "lz4": importlib.import_module("lz4.frame").LZ4FrameDecompressor,
         "zstd": _zstd().ZstdDecompressor,
@@ -56,18 +50,10 @@ def bound_unpacking() -> None:
     for table in (ros1, mcap):
         for name in set(table) & set(unpackers):
             table[name] = _bounded(unpackers[name], "chunk")
-    vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"] = _BoundedZstd()
-
-
-class _BoundedZstd:
-    """The two functions of the module ``zstd`` with which rosbags reads ROS 2 bags: ``decompress`` for a
-    message, ``open`` for a file."""
-
-    def __init__(self) -> None:
-        self.decompress = _bounded(_zstd().ZstdDecompressor, "message")
-
-    def open(self, packed: BinaryIO, mode: str) -> "_BoundedFile":
-        return _BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size)
+    vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"] = SimpleNamespace(
+        decompress=_bounded(_zstd().ZstdDecompressor, "message"),
+        open=lambda packed, mode: _BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
+    )
 
 
 class _BoundedFile:
@@ -91,7 +77,7 @@ class _BoundedFile:
         return found
 
 
-def _bounded(make: Callable[[], _Unpacker], what: str) -> Callable[..., bytes]:
+def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:
     def unpack(packed: bytes, claimed: int | None = None) -> bytes:
         """``claimed`` is the size that MCAP's reader expects; that of ROS 1 passes none."""
         most = max(_LEAST_BOUND, _LARGEST_RATIO * len(packed))
@@ -313,7 +299,7 @@ class RosReader:
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):
                 check_regular(file, DatasetError)
-        _library("rosbags.highlevel")
+        library("rosbags.highlevel", "bags need", "ros", DatasetError)
         try:
             bound_unpacking()
             self._reader, unread = open_tolerantly(self.parts or files_of(path) or [path])
@@ -415,10 +401,6 @@ def _unreadable(problem: str) -> str:
         f"cannot be read as a bag, it is damaged or cut short: {problem}; 'rosbag reindex', 'ros2 bag "
         "reindex' or 'mcap recover' may mend a recording that was not closed"
     )
-
-
-def _library(name: str) -> Any:
-    return library(name, "bags need", "ros", DatasetError)
 
 
 def _header(message: Any, recorded_ns: int) -> tuple[float, str]:

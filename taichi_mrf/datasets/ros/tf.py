@@ -337,10 +337,9 @@ def _one_parent(parent: str, child: str, rows: Sequence[_Sent], last: bool) -> E
             return T
         remedy = f"?tf={LAST} takes the last, " + remedy if not moving else remedy
     else:
-        edge, disagree = TimedPoses([r.stamp for r in moving], [r.pose for r in moving]), False
-        disagree = alternates([r.stamp for r in moving], [r.pose for r in moving])
-        if not disagree:
-            return edge
+        stamps, poses = [each.stamp for each in moving], [each.pose for each in moving]
+        if not alternates(stamps, poses):
+            return TimedPoses(stamps, poses)
     nodes = sorted({each.publisher for each in rows} - {""})
     if len(nodes) > 1:
         remedy = f"choose one with {' or '.join(f'?tf={node}' for node in nodes)}; {remedy}"

@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.options import require
 from taichi_mrf.datasets.synthetic.analytic_scene import Color, Point, Scene, Solid, translated
 from taichi_mrf.datasets.synthetic.rendered_sequence import RenderedSequence, RenderOptions, open_scene
 from taichi_mrf.datasets.synthetic.room_furniture import (
@@ -408,7 +409,7 @@ class CorridorOptions(RenderOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require(rooms=1)
+        require(self, rooms=1)
 
 
 @dataclass
@@ -446,7 +447,7 @@ class RingOptions(RenderOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require(length=24)
+        require(self, length=24)
 
 
 @dataclass

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets.base import Dataset, StatedSensor
-from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions, parse_options
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions, parse_options, require
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
-from taichi_mrf.errors import BackendError, ConfigError, DatasetError
+from taichi_mrf.errors import BackendError, DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -101,13 +101,7 @@ class RenderOptions:
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
 
     def __post_init__(self) -> None:
-        self.require(frames=1, width=8, height=8, seed=0)
-
-    def require(self, **least: int) -> None:
-        """Raise ConfigError for the first of these fields that is less than its least value."""
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise ConfigError(f"{name} must be at least {value}, not {getattr(self, name)}")
+        require(self, frames=1, width=8, height=8, seed=0)
 
     def camera(self) -> PinholeCamera:
         """The Kinect 1's field of view on this many pixels, which are square."""

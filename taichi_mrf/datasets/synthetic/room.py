@@ -10,7 +10,7 @@ the camera. Places of a script are in the room's own frame, as in room_furniture
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Literal
@@ -58,13 +58,7 @@ class Place:
 
     def towards(self, other: "Place", share: float) -> "Place":
         """The place at ``share``, 0 to 1, of the straight way to another."""
-        ways = (
-            (self.x, other.x),
-            (self.y, other.y),
-            (self.z, other.z),
-            (self.yaw, other.yaw),
-        )
-        return Place(*(a + share * (b - a) for a, b in ways))
+        return Place(*(a + share * (b - a) for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ local transform. That is the pose of the camera's optical frame on the robot. A 
 one after the other.
 
 Depth images are PNGs of 16-bit millimetres, PNGs whose four 8-bit channels are the bytes of float32 metres,
-RVL (rvl.py) behind a name of 8 bytes, or inverse depth in 16 bits, as a PNG or as RVL.
+RVL (images.py) behind a name of 8 bytes, or inverse depth in 16 bits, as a PNG or as RVL.
 """
 
 import contextlib
@@ -44,6 +44,7 @@ from taichi_mrf.datasets.images import (
     claimed_size,
     decode_16_bit,
     decode_color,
+    decode_rvl,
     decode_unchanged,
     measured,
     note_of_largest,
@@ -51,7 +52,6 @@ from taichi_mrf.datasets.images import (
 )
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile
-from taichi_mrf.datasets.rvl import decode_rvl
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
