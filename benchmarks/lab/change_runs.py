@@ -16,8 +16,7 @@ from benchmarks.lab.moving_truth import NEAR_M, Mask, MovingTruth, Points, Stand
 from benchmarks.lab.robot_paths import RADIUS_M, Drives, Paths
 from taichi_mrf import Frame, LogOddsMap, MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.sections import LIVE_HALF_LIFE_S, TimeConfig
-from taichi_mrf.datasets.synthetic.moving_scene import distance_to_solids
-from taichi_mrf.datasets.synthetic.room import SyntheticRoom
+from taichi_mrf.datasets.synthetic.room import SyntheticRoom, distance_to_solids
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.methods.capabilities import has_messages

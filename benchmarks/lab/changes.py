@@ -25,7 +25,7 @@ from benchmarks.lab.change_runs import (
 )
 from benchmarks.lab.moving_truth import MovingTruth
 from benchmarks.lab.robot_paths import LENGTH_M, PLAY_M, RADIUS_M
-from taichi_mrf.datasets.synthetic.moving_room import SCRIPTS
+from taichi_mrf.datasets.synthetic.room import SCRIPTS
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid, ball_radius, distance_to
-from taichi_mrf.datasets.synthetic.moving_scene import Thing, distance_to_solids, placed
-from taichi_mrf.datasets.synthetic.room import SyntheticRoom
+from taichi_mrf.datasets.synthetic.room import SyntheticRoom, Thing, distance_to_solids, placed
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.simulate import KINECT_1, simulate

@@ -21,8 +21,8 @@ from taichi_mrf.config.schema import Arch, Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
-from taichi_mrf.datasets.ros.summary import BagSummary
-from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
+from taichi_mrf.datasets.ros.bag import BagSummary
+from taichi_mrf.datasets.ros.bag import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import UNUSED_COLOR, note_unused_color, summarise
 from taichi_mrf.errors import DatasetError

@@ -20,9 +20,8 @@ from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.config.text import commented_yaml
-from taichi_mrf.datasets.laser.plan_image import FloorPlan, read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
+from taichi_mrf.datasets.laser.scans import FloorPlan, LaserScans, beams_of, read_floor_plan
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.floor_plan import (
     CellScores,

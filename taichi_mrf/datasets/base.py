@@ -41,7 +41,8 @@ def when_called(place: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of recording in a folder or a file: its entry in the list (entries.py), or a plug (plugs.py)."""
+    """A kind of recording in a folder or a file: its entry in the list (entries.py), or a plug
+    (registry.py)."""
 
     name: str
 
@@ -177,6 +178,13 @@ class Row:
     stamp: float
     pose: Pose | Callable[[], Pose]
     pose_source: str
+
+
+@dataclass(frozen=True)
+class NumberedRow(Row):
+    """A frame, and its number in the recording."""
+
+    number: int
 
 
 AnyRow = TypeVar("AnyRow", bound=Row)

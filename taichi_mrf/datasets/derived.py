@@ -1,15 +1,29 @@
-"""Datasets that show the frames of another one in another way."""
+"""Datasets that show the frames of another one in another way.
+
+Pixels are resampled: undistorted, thinned out, or both. Each output pixel is one recorded measurement: the
+one nearest to where its ray crosses the recorded image. Nothing is averaged. An average would mix the depths
+on both sides of an edge into surfaces that do not exist, and the mean or the minimum of several pixels has
+another noise than the sensor model assumes (the minimum of four is one sigma too near).
+
+A recording is mended: its conventions are undone (conventions.py), and its origin is put near its first pose.
+This is done on frames, so that it is the same for all formats.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, StatedSensor
-from taichi_mrf.errors import LostFrameError
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
+from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, LostFrameError, naming
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -107,3 +121,304 @@ class Chosen(Derived):
 def chosen(dataset: Dataset, indices: Sequence[int]) -> Chosen:
     """Some frames of a dataset, in the order of their ``indices``."""
     return Chosen(dataset.name, dataset.camera, source=dataset, indices=indices)
+
+
+@dataclass
+class Resampled(Derived):
+    """The frames of ``source``, each pixel of them picked from the recorded image.
+
+    ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
+    did not meet the recorded image, which is no measurement. One in ``stride`` of them is kept; if they are
+    not ``distorted``, frames may have cameras of their own.
+    """
+
+    rows: NDArray[np.int64] = field(kw_only=True)
+    columns: NDArray[np.int64] = field(kw_only=True)
+    stride: int = field(kw_only=True)
+    distorted: bool = field(kw_only=True)
+
+    def read(self, index: int) -> Frame:
+        """Read the source's frame and pick its pixels. Raises what the source raises."""
+        frame = self.source.read(index)
+        if frame.depth_m.shape != self.source.camera.shape:
+            raise FrameError(f"{frame.name}: the image has the shape {frame.depth_m.shape}")
+        outside = self.rows < 0
+        depth_m = frame.depth_m[self.rows, self.columns]
+        depth_m[outside] = 0.0
+        color = None
+        if frame.color is not None:
+            color = frame.color[self.rows, self.columns]
+            color[outside] = 0
+        sigma_m = None if frame.sigma_m is None else frame.sigma_m[self.rows, self.columns]
+        no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] & ~outside
+        return replace(
+            frame,
+            depth_m=depth_m,
+            camera=self._camera(frame),
+            color=color,
+            sigma_m=sigma_m,
+            no_return=no_return,
+        )
+
+    def _camera(self, frame: Frame) -> Camera:
+        """The camera of the pixels that are kept of a frame."""
+        if frame.camera == self.source.camera:
+            return self.camera
+        if self.distorted:
+            raise FrameError(f"frame {frame.name}: has intrinsics of its own; --undistort needs --camera too")
+        return strided(pinhole(frame.camera, "--image-scale"), self.stride)[0]
+
+
+def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dataset:
+    """The dataset with its images undistorted and one in ``stride`` of their rows and columns kept.
+
+    ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
+    camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
+    left of an image, and if its camera is no pinhole.
+    """
+    distorted = any(distortion)
+    if not distorted and stride == 1:
+        return dataset
+    with naming(dataset.name, ConfigError):
+        recorded = pinhole(dataset.camera, "--undistort" if distorted else "--image-scale")
+    with naming(f"{dataset.name}: image_scale 1/{stride} leaves no pixel", ConfigError):
+        camera, first = strided(recorded, stride)
+    rows, columns = np.meshgrid(
+        first[0] + stride * np.arange(camera.height),
+        first[1] + stride * np.arange(camera.width),
+        indexing="ij",
+    )
+    notes = list(dataset.notes)
+    if distorted:
+        rows, columns = _recorded_pixels(recorded, distortion, rows, columns)
+        share = float((rows < 0).mean())
+        notes.append(
+            f"images undistorted with {', '.join(f'{k:g}' for k in distortion)}, "
+            f"{share:.1%} of their pixels lie outside the recorded ones"
+        )
+    if stride > 1:
+        notes.append(f"one in {stride} rows and columns is read: {camera.width} x {camera.height} pixels")
+    return Resampled(
+        name=dataset.name,
+        camera=camera,
+        notes=notes,
+        dropped=dataset.dropped,
+        source=dataset,
+        rows=rows,
+        columns=columns,
+        stride=stride,
+        distorted=distorted,
+    )
+
+
+def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[int, int]]:
+    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept.
+
+    Its rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
+    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left.
+    """
+    first = (stride - 1) // 2
+    thin = PinholeCamera(
+        width=len(range(first, camera.width, stride)),
+        height=len(range(first, camera.height, stride)),
+        fx=camera.fx / stride,
+        fy=camera.fy / stride,
+        cx=(camera.cx - first) / stride,
+        cy=(camera.cy - first) / stride,
+    )
+    return thin, (first, first)
+
+
+def _recorded_pixels(
+    camera: PinholeCamera, distortion: Sequence[float], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which recorded pixel saw along the ray of each undistorted pixel, -1 where none did."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    rays = camera.rays()[rows, columns]
+    seen, _ = cv2.projectPoints(
+        rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.asarray(distortion, np.float64)
+    )
+    u, v = np.rint(seen.reshape(*rows.shape, 2)).transpose(2, 0, 1)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    inside &= np.hypot(rays[..., 0], rays[..., 1]) < _validity(distortion, camera.largest_slant())
+    return np.where(inside, v, -1).astype(np.int64), np.where(inside, u, -1).astype(np.int64)
+
+
+def _validity(distortion: Sequence[float], reach: float) -> float:
+    """The tangent of the angle off the axis up to which the lens model is one-to-one, at most ``reach``:
+    beyond, a polynomial that was fitted to the image turns back and would show its inside once more."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *[0.0] * (8 - len(distortion)))
+    r = np.linspace(0.0, reach, 4096)
+    bent = r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3))) / (1 + r**2 * (k4 + r**2 * (k5 + r**2 * k6)))
+    turns = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[turns[0]]) if len(turns) else float("inf")
+
+
+NEAR_ORIGIN_M = 1000.0
+"""The origin is moved where the first pose is farther from it, as in coordinates of a country. Maps reach
+65,536 voxels to each side, and up to here a kernel's 32-bit numbers are exact to a tenth of a millimetre."""
+
+ORIGIN_STEP_M = 1000.0
+"""Origins are multiples of it, so that recordings of one place have the same one."""
+
+T_AXES_OPTICAL: dict[str, NDArray[np.float64]] = {
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+"""The rotations that take optical axes to others."""
+
+
+def pose_of(T_recorded: Pose, conventions: Conventions) -> Pose:
+    """T_world_camera, (4, 4), of a recorded pose."""
+    T = T_recorded.copy()
+    if conventions.w_first:
+        w, x, y, z = quaternion(T[:3, :3])
+        T = pose_from_quaternion(np.array([*T[:3, 3], x, y, z, w]))
+    if conventions.unit:
+        T[:3, 3] /= POSE_UNITS[conventions.unit]
+    if conventions.inverse:
+        T = inverse(T)
+    if conventions.axes:  # a product with the identity would lose the sign of zeros, which orders keyframes
+        T[:3, :3] = T[:3, :3] @ T_AXES_OPTICAL[conventions.axes]
+    if conventions.mounting:
+        T = T @ pose_from_quaternion(np.array(conventions.mounting))
+    return T
+
+
+def axial_depth(
+    depth_m: NDArray[np.float32], camera: Camera, conventions: Conventions
+) -> NDArray[np.float32]:
+    """Depth along the rays as :class:`Frame` has it, (H, W) metres, of recorded depth."""
+    if not conventions.along_ray:
+        return depth_m
+    length = np.linalg.norm(camera.rays(), axis=-1)
+    return (depth_m / length).astype(np.float32)
+
+
+def origin_of(position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The origin (3,) near a position: zero, unless that is far from it."""
+    far = np.abs(position_m).max() > NEAR_ORIGIN_M
+    return np.rint(position_m / ORIGIN_STEP_M) * ORIGIN_STEP_M if far else np.zeros(3)
+
+
+def stated_origin(dataset: Dataset) -> tuple[float, ...] | None:
+    """The origin as a dataset's frames state it, None if it was not moved."""
+    origin_m = dataset.origin_m
+    return tuple(origin_m.tolist()) if origin_m.any() else None
+
+
+def moved_note(origin_m: NDArray[np.float64]) -> str:
+    """A note that the origin was moved."""
+    return "the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*(origin_m + 0.0))
+
+
+@dataclass
+class Mended(Derived):
+    """The frames of ``source`` with ``conventions`` undone and the origin moved by ``moved_m`` (3,). Where
+    poses are late, ``timed`` are the mended ones, in which those of frames are interpolated; else None."""
+
+    conventions: Conventions = field(kw_only=True)
+    timed: TimedPoses | None = field(kw_only=True)
+    gap_s: float = field(kw_only=True)
+    moved_m: NDArray[np.float64] = field(kw_only=True)
+
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """The source's, and by how much it is moved on."""
+        return self.source.origin_m + self.moved_m
+
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame. Raises what the source raises."""
+        if self.timed is None:
+            T = pose_of(self.source.pose(index), self.conventions)
+        else:
+            found = self.timed.at(float(self.source.stamps()[index]) + self.conventions.late_s, self.gap_s)
+            if found is None:
+                raise FrameError(
+                    f"frame {self.frame_names[index]}: no pose {self.conventions.late_s:g} s later"
+                )
+            T = found
+        T[:3, 3] -= self.moved_m
+        return T
+
+    def read(self, index: int) -> Frame:
+        """The source's frame. Raises what the source raises."""
+        frame = self.source.read(index)
+        depth_m = axial_depth(frame.depth_m, frame.camera, self.conventions)
+        T = pose_of(frame.T_world_camera, self.conventions)
+        T[:3, 3] -= self.moved_m
+        T = T if self.timed is None else self.pose(index)
+        return replace(frame, depth_m=depth_m, T_world_camera=T, origin_m=stated_origin(self))
+
+
+def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | None = None) -> Dataset:
+    """The dataset with its conventions undone and its origin near the first pose. Raises DatasetError if none
+    of its frames has a pose."""
+    origin_m = np.zeros(3)
+    if not dataset.tracked and not dataset.endless:
+        first = _first_pose(dataset, conventions)
+        origin_m = np.zeros(3) if first is None else origin_of(first[:3, 3])
+    if conventions == AS_USUAL and not origin_m.any():
+        return dataset
+    timed, gap_s = None, 0.0
+    if conventions.late_s:
+        dataset, timed, gap_s = _shifted(dataset, conventions, max_time_gap)
+    notes = list(dataset.notes)
+    if conventions != AS_USUAL:
+        notes.append(f"conventions: {' '.join(conventions.flags())}")
+    if origin_m.any():
+        notes.append(moved_note(origin_m))
+    return Mended(
+        dataset.name,
+        dataset.camera,
+        notes,
+        dataset.dropped,
+        dataset.distortion,
+        dataset.tracked,
+        source=dataset,
+        conventions=conventions,
+        timed=timed,
+        gap_s=gap_s,
+        moved_m=origin_m,
+    )
+
+
+def _first_pose(dataset: Dataset, conventions: Conventions) -> Pose | None:
+    """The pose of the first frame that has one."""
+    for index in range(len(dataset)):
+        try:
+            return pose_of(dataset.pose(index), conventions)
+        except FrameError:
+            continue
+    return None
+
+
+def _shifted(
+    dataset: Dataset, conventions: Conventions, max_time_gap: float | None
+) -> tuple[Dataset, TimedPoses, float]:
+    """The frames that have a pose ``late_s`` later, all mended poses, and the largest gap between two."""
+    known: list[int] = []
+    poses: list[Pose] = []
+    for index in range(len(dataset)):
+        try:
+            poses.append(pose_of(dataset.pose(index), conventions))
+            known.append(index)
+        except FrameError:
+            continue
+    stamps = np.asarray(dataset.stamps(), np.float64)
+    timed = TimedPoses(stamps[known], poses)
+    usual_s = float(np.median(np.diff(timed.stamps))) if len(timed) > 1 else 0.0
+    gap_s = max_time_gap or max(INTERPOLATION_GAP, 2.0 * usual_s)
+    kept = [
+        i for i in range(len(dataset)) if timed.at(float(stamps[i]) + conventions.late_s, gap_s) is not None
+    ]
+    if not kept:
+        raise DatasetError(f"{dataset.name}: no frame has a pose {conventions.late_s:g} s later")
+    if len(kept) == len(dataset):
+        return dataset, timed, gap_s
+    picked: Chosen = chosen(dataset, kept)
+    picked.notes = [
+        *dataset.notes,
+        f"{len(dataset) - len(kept)} frames dropped: no poses {conventions.late_s:g} s later",
+    ]
+    return picked, timed, gap_s

@@ -2,7 +2,7 @@
 
 A format's reader is a module that is named here and imported when a source of that format is opened. The
 first entry that recognises a folder or a file opens it, even if some of its files are missing or damaged:
-opening reports them. Formats of other packages, and those that few have, are plugs (plugs.py).
+opening reports them. Formats of other packages, and those that few have, are plugs (registry.py).
 """
 
 import re
@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 from taichi_mrf.datasets.base import BuiltIn, Format, when_called
 from taichi_mrf.datasets.ros.names import METADATA, SUFFIXES, is_bag
@@ -106,89 +107,90 @@ def _is_scan_folder(path: Path) -> bool:
     return may_be and resolve_name(f"{HERE}.lidar.scan_folder:recognises")(path)
 
 
+def reader(place: str) -> Callable[..., Any]:
+    """What opens a source, "module:function" in this package, which is imported when it is called."""
+    return when_called(f"{HERE}.{place}")
+
+
 FORMATS: tuple[Format, ...] = (
     Format(
         "7-Scenes",
         "frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt",
         _has_named(r"frame-\d+\.(depth\.png|pose\.txt)"),
-        when_called(f"{HERE}.formats.seven_scenes:open_folder"),
+        reader("formats.seven_scenes:open_folder"),
     ),
     Format(
         "TUM RGB-D",
         "depth.txt and groundtruth.txt",
         lambda path: _has("depth.txt")(path) or bool(stamped_images(path)),
-        when_called(f"{HERE}.formats.tum_rgbd:open_folder"),
+        reader("formats.tum_rgbd:open_folder"),
     ),
     Format(
         "ScanNet",
         "depth/N.png and pose/N.txt",
         _has("depth/", "pose/"),
-        when_called(f"{HERE}.formats.scannet:open_folder"),
+        reader("formats.scannet:open_folder"),
     ),
     Format(
         "Replica (NICE-SLAM)",
         "results/depthNNNNNN.png and traj.txt",
         _has_named(r"depth\d+\.png", "results"),
-        when_called(f"{HERE}.formats.replica:open_folder"),
+        reader("formats.replica:open_folder"),
     ),
     Format(
         "ICL-NUIM / Redwood",
         NUMBERED_FILES,
         lambda path: bool(numbered_images(path)),
-        when_called(f"{HERE}.formats.numbered_depth:open_folder"),
+        reader("formats.numbered_depth:open_folder"),
     ),
     Format(
         "KITTI stereo",
         "image_l and image_r (or image_0 and image_1) with calib.txt and poses.txt",
         lambda path: _has("image_l/", "image_r/")(path) or _has("image_0/", "image_1/")(path),
-        when_called(f"{HERE}.stereo.kitti:open_folder"),
+        reader("formats.kitti:open_pairs"),
     ),
     Format(
         "ROS bag",
         f"{', '.join(SUFFIXES)} or the folder of a ROS 2 bag with {METADATA}, or of a split one",
         is_bag,
-        when_called(f"{HERE}.ros.bag:open_bag"),
+        reader("ros.bag:open_bag"),
         takes_query=True,
     ),
     Format(
         "KITTI velodyne",
         "velodyne/NNNNNN.bin with calib.txt and poses.txt",
         _is_velodyne,
-        when_called(f"{HERE}.lidar.kitti_velodyne:open_folder"),
+        reader("formats.kitti:open_scans"),
     ),
     Format(
         "lidar scans",
         "scan-NNN.npz (xyz), *.ply, *.pcd, *.las or *.bin with poses.npz or a file of poses; "
         "*.pcd with VIEWPOINT",
         _is_scan_folder,
-        when_called(f"{HERE}.lidar.scan_folder:open_folder"),
+        reader("lidar.scan_folder:open_folder"),
         takes_query=True,
     ),
     Format(
         "npz",
         "*.npz with depth_m, T_world_camera and K",
         holds_frames,
-        when_called(f"{HERE}.formats.frames_npz:open_npz_frames"),
+        reader("formats.frames_npz:open_npz_frames"),
     ),
     Format(
         "stereo pairs",
         ".yaml that describes stereo pairs",
         lambda path: path.suffix in YAML and is_file(path),
-        when_called(f"{HERE}.stereo.rig_file:open_file"),
+        reader("stereo.rig_file:open_file"),
     ),
 )
 
 BUILT_IN: dict[str, BuiltIn] = {
     each.name: each
     for each in (
-        BuiltIn("synthetic:room", when_called(f"{HERE}.synthetic.room:open_synthetic_room"), rendered=True),
-        BuiltIn(
-            "synthetic:corridor",
-            when_called(f"{HERE}.synthetic.corridor:open_synthetic_corridor"),
-            rendered=True,
-        ),
-        BuiltIn("synthetic:ring", when_called(f"{HERE}.synthetic.ring:open_synthetic_ring"), rendered=True),
-        BuiltIn("mesh:", when_called(f"{HERE}.synthetic.mesh_sequence:open_mesh")),
-        BuiltIn(REALSENSE, when_called(f"{HERE}.realsense.device:open_realsense")),
+        BuiltIn("synthetic:room", reader("synthetic.room:open_synthetic_room"), rendered=True),
+        BuiltIn("synthetic:corridor", reader("synthetic.corridor:open_synthetic_corridor"), rendered=True),
+        BuiltIn("synthetic:ring", reader("synthetic.corridor:open_synthetic_ring"), rendered=True),
+        BuiltIn("mesh:", reader("synthetic.mesh_scene:open_mesh")),
+        BuiltIn(REALSENSE, reader("realsense.device:open_realsense")),
     )
 }

@@ -10,8 +10,7 @@ import numpy as np
 
 from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.laser.readers import holds_scans
-from taichi_mrf.datasets.lidar.clouds import is_cloud
-from taichi_mrf.datasets.lidar.ply_file import read_ply_header
+from taichi_mrf.datasets.lidar.clouds import is_cloud, read_ply_header
 from taichi_mrf.datasets.trajectories import is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import is_file, is_folder, read_text

@@ -1,8 +1,17 @@
-"""Image files to arrays: depth images with all their checks, colour images, and the same back to disk."""
+"""Image files to arrays: depth images with all their checks, colour images, and the same back to disk.
 
+The size that a file claims is read from its header before a decoder takes memory for it. The formats in
+_READERS are the only ones that are decoded: what a decoder allocates for any other cannot be bounded
+beforehand.
+
+RVL is a code for depth images without loss (A. Wilson, "Fast Lossless Depth Image Compression", ISS 2017):
+runs of zeros and of other pixels, whose differences from each other are numbers of three bits a nibble.
+"""
+
+import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,11 +19,114 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.image_header import KNOWN, PNG_SIGNATURE, claimed_size
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import DEFLATE_RATIO
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+KNOWN = "PNG, JPEG, TIFF, WebP, BMP, PGM, PPM"
+
+Size = tuple[int, int]
+
+
+def claimed_size(data: bytes) -> Size | None:
+    """(width, height) in pixels by the header of an encoded image.
+
+    None for a damaged header and for other formats than those of KNOWN.
+    """
+    read = next((read for signature, read in _READERS if re.match(signature, data, re.DOTALL)), None)
+    try:
+        size = None if read is None else read(data)
+    except (struct.error, IndexError):  # the header is cut short
+        return None
+    return size if size is not None and min(size) > 0 else None
+
+
+def _png(data: bytes) -> Size | None:
+    width, height = struct.unpack_from(">II", data, 16)
+    return (width, height) if data[12:16] == b"IHDR" else None
+
+
+def _jpeg(data: bytes) -> Size | None:
+    position = 2
+    while data[position] == 0xFF:
+        if data[position + 1] == 0xFF:  # fill bytes may precede a marker
+            position += 1
+            continue
+        if data[position + 1] in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return width, height
+        position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+    return None
+
+
+def _bmp(data: bytes) -> Size | None:
+    if struct.unpack_from("<I", data, 14)[0] == 12:  # the header of OS/2
+        width, height = struct.unpack_from("<HH", data, 18)
+    else:
+        width, height = struct.unpack_from("<ii", data, 18)
+    return width, abs(height)  # negative: rows from the top
+
+
+def _pnm(data: bytes) -> Size | None:
+    found = re.match(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s", data)
+    return (int(found[1]), int(found[2])) if found else None
+
+
+def _webp(data: bytes) -> Size | None:
+    kind = data[12:16]
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8X" and not data[20] & _WEBP_ANIMATION:
+        return tuple(1 + int.from_bytes(data[i : i + 3], "little") for i in (24, 27))  # type: ignore[return-value]
+    return None
+
+
+def _tiff(data: bytes) -> Size | None:
+    """The size of the first image, which is the one that is decoded; of a tile of it if that is larger."""
+    order = "<" if data[:2] == b"II" else ">"
+    (begin,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, begin)
+    values = {}
+    for entry in range(begin + 2, begin + 2 + 12 * count, 12):
+        tag, kind, items = struct.unpack_from(f"{order}HHI", data, entry)
+        if tag in _TIFF_SIZES:
+            if tag in values or items != 1 or kind not in _TIFF_KINDS:
+                return None
+            (values[tag],) = struct.unpack_from(f"{order}{_TIFF_KINDS[kind]}", data, entry + 8)
+    width, height, tile_width, tile_height = (values.get(tag, 0) for tag in _TIFF_SIZES)
+    if tile_width * tile_height > max(width * height, _LARGEST_TILE):
+        return tile_width, tile_height
+    return width, height
+
+
+_READERS: tuple[tuple[bytes, Callable[[bytes], Size | None]], ...] = (
+    (re.escape(PNG_SIGNATURE), _png),
+    (rb"\xff\xd8", _jpeg),
+    (rb"BM", _bmp),
+    (rb"P[1-6]", _pnm),
+    (rb"RIFF....WEBP", _webp),
+    (rb"II\*\0|MM\0\*", _tiff),
+)
+"""What files of each format begin with, and the reader of their headers."""
+
+_JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+"""Markers of a JPEG's segments that begin with its size."""
+
+_WEBP_ANIMATION = 2
+
+_TIFF_SIZES = (256, 257, 322, 323)
+"""ImageWidth, ImageLength, TileWidth, TileLength."""
+
+_TIFF_KINDS = {3: "H", 4: "I"}
+_LARGEST_TILE = 1 << 20
+"""Pixels of a tile that is larger than its image; small images have tiles of 256 x 256."""
+
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 """Of depth images that folders may hold."""
@@ -93,10 +205,15 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     return _decode(_image_file(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image file. Raises DatasetError, whose text names the file."""
-    height, width = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
-    return width, height
+def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+    """(width, height) of the first image that can be read; a broken one is reported with its frame."""
+    for path in paths:
+        try:
+            height, width = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
+            return width, height
+        except DatasetError:
+            continue
+    return None
 
 
 def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint16]:
@@ -237,3 +354,46 @@ _CHUNK_BYTES = 12
 _PIECE = 1 << 20
 _SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Samples of a pixel by a PNG's type of colour."""
+
+
+def decode_rvl(data: bytes) -> NDArray[np.uint16]:
+    """The image (H, W) behind two integers, width and height, as ROS's compressedDepth and RTAB-Map write
+    it. Raises DatasetError if it is damaged."""
+    if len(data) < 8:
+        raise DatasetError("RVL data are cut short")
+    width, height = struct.unpack_from("<II", data)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise DatasetError(f"{width} x {height} pixels; at most {MOST_PIXELS:,} are read")
+    numbers = _rvl_numbers(np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8))
+    runs, place, at, counts = [], 0, 0, numbers.tolist()
+    while place < width * height:
+        if at + 2 > len(counts) or min(counts[at : at + 2]) < 0:
+            raise DatasetError("RVL data are cut short")
+        zeros, others = counts[at : at + 2]
+        place += zeros
+        runs.append((place, at + 2, others))
+        place, at = place + others, at + 2 + others
+    if place > width * height or at > len(counts):
+        raise DatasetError("RVL data do not fit the image's size")
+    pixels, coded, count = (np.array(column, np.int64) for column in zip(*runs, strict=True))
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    steps = numbers[np.repeat(coded, count) + within]
+    image = np.zeros(width * height, np.uint16)
+    values = np.cumsum((steps >> 1) ^ -(steps & 1))
+    if values.min(initial=0) < 0 or values.max(initial=0) > np.iinfo(np.uint16).max:
+        raise DatasetError("RVL data are damaged: a depth is out of range")
+    image[np.repeat(pixels, count) + within] = values.astype(np.uint16)
+    return image.reshape(height, width)
+
+
+def _rvl_numbers(words: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """The numbers in words of eight nibbles, the first in the upper bits: three bits each, the lowest first,
+    below a bit that tells that more follow."""
+    nibbles = ((words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15).ravel().astype(np.int64)
+    last = np.flatnonzero(nibbles < 8)
+    first = np.concatenate([[0], last[:-1] + 1]) if len(last) else last
+    if len(last) and (last - first).max() > 10:
+        raise DatasetError("RVL data are damaged")
+    nibbles = nibbles[: last[-1] + 1] if len(last) else nibbles[:0]
+    place = np.arange(len(nibbles)) - np.repeat(first, last - first + 1)
+    return np.add.reduceat((nibbles & 7) << (3 * place), first) if len(last) else nibbles

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TypeVar, get_type_hints
 
 from taichi_mrf.config.files import parse_yaml
-from taichi_mrf.config.values import from_dict
+from taichi_mrf.config.values import check_field, from_dict
 from taichi_mrf.datasets.conventions import AXIAL, Conventions, conventions_of
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -99,6 +99,13 @@ class ReadOptions:
     def stride(self) -> int:
         """Every ``stride``-th row and column is read."""
         return round(1 / self.image_scale)
+
+
+def require(options: object, **least: float) -> None:
+    """Raise ConfigError for the first of these fields that is less than its least value."""
+    for name, value in least.items():
+        given = getattr(options, name)
+        check_field(given >= value, name, f"must be at least {value}, not {given}")
 
 
 def parse_options(cls: type[T], query: str, source: str) -> T:

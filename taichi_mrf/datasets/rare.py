@@ -1,4 +1,5 @@
-"""Formats that few have: plugs (plugs.py) of this package, declared in pyproject.toml as another's would be.
+"""Formats that few have: plugs (registry.py) of this package, declared in pyproject.toml as another's would
+be.
 
 What tells that a source is one is here; the readers are imported when such a source is opened.
 """
@@ -6,7 +7,8 @@ What tells that a source is one is here; the readers are imported when such a so
 from pathlib import Path
 
 from taichi_mrf.config.files import read_yaml
-from taichi_mrf.datasets.base import Format, when_called
+from taichi_mrf.datasets.base import Format
+from taichi_mrf.datasets.entries import reader
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.files import is_file, is_folder
 
@@ -38,37 +40,37 @@ SEVERAL_SENSORS = Format(
     "several sensors",
     "a .yaml file with a list of sensors",
     _lists_sensors,
-    when_called("taichi_mrf.datasets.several_sensors:open_file"),
+    reader("several_sensors:open_file"),
 )
 STRAY_SCANNER = Format(
     "Stray Scanner",
     "depth/NNNNNN.png with camera_matrix.csv and odometry.csv",
     _is_stray_scanner,
-    when_called("taichi_mrf.datasets.formats.stray_scanner:open_folder"),
+    reader("formats.stray_scanner:open_folder"),
 )
 RECORD3D = Format(
     "Record3D",
     "*.r3d, or a folder with metadata and rgbd/N.depth",
     _is_record3d,
-    when_called("taichi_mrf.datasets.formats.record3d:open_recording"),
+    reader("formats.record3d:open_recording"),
 )
 LAS = Format(
     "LAS survey",
     "*.las or *.laz, with the file of the lidar's poses",
     lambda path: path.suffix.lower() in (".las", ".laz") and is_file(path),
-    when_called("taichi_mrf.datasets.lidar.las_trajectory:open_survey"),
+    reader("lidar.las_file:open_survey"),
     takes_query=True,
 )
 OUSTER = Format(
     "Ouster",
     "*.osf, or *.pcap with its .json",
     lambda path: path.suffix.lower() in (".osf", ".pcap") and is_file(path),
-    when_called("taichi_mrf.datasets.lidar.ouster:open_recording"),
+    reader("lidar.ouster:open_recording"),
     takes_query=True,
 )
 RTABMAP = Format(
     "RTAB-Map",
     "a database (.db)",
     lambda path: path.suffix == ".db" and is_file(path),
-    when_called("taichi_mrf.datasets.rtabmap.recording:open_database"),
+    reader("formats.rtabmap:open_database"),
 )

@@ -3,8 +3,10 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -22,6 +25,9 @@ from taichi_mrf.sensor.frame import Frame
 
 ASKED = "--depth-scale"
 """Origin of a scale that the caller gives."""
+
+LOST = "tracking was lost"
+"""Why a frame without a pose is left out."""
 
 _LOOKED_AT = 4
 """Images of which the kind and the share of the largest value are found when a recording is opened."""
@@ -137,6 +143,40 @@ class Recording(Table[RecordedFrame]):
                 "which is not plausible; check --depth-scale"
             )
         return notes
+
+
+def recording(
+    folder: Path,
+    options: ReadOptions,
+    camera: PinholeCamera,
+    rows: Sequence[RecordedFrame],
+    steps_per_metre: float,
+    scale_source: str,
+    notes: Sequence[str] = (),
+    listed: int | None = None,
+    why_dropped: str = "",
+    **more: Any,
+) -> Recording:
+    """The recording in a folder. A scale that the user gives replaces the format's. Of the images that were
+    ``listed`` some have no row: a note says ``why_dropped``, unless the caller has said so."""
+    dropped = 0 if listed is None else listed - len(rows)
+    said = [f"{dropped} of {listed} images dropped: {why_dropped}"] if dropped and why_dropped else []
+    return Recording(
+        folder.name,
+        camera,
+        [*notes, *said],
+        dropped,
+        rows=rows,
+        steps_per_metre=options.depth_scale or steps_per_metre,
+        scale_source=ASKED if options.depth_scale else scale_source,
+        color=options.color,
+        **more,
+    )
+
+
+def first_file(candidates: Iterable[Path]) -> Path | None:
+    """The first of some files that is there."""
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:

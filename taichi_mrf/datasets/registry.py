@@ -1,24 +1,82 @@
-"""Sources of frames are opened here: folders and files by the first plug (plugs.py), else the first entry
-(entries.py) that recognises them, and the built-in sources by their names."""
+"""Sources of frames are opened here: folders and files by the first plug, else the first entry (entries.py)
+that recognises them, and the built-in sources by their names.
+
+A plug is a format that another package brings, or one of this package's that few have: an entry point of the
+group GROUP that names a Format (base.py). It is asked before the formats of entries.py, so that it can read
+what one of those would take. One that cannot be used breaks no other.
+"""
 
 import difflib
 import re
 import warnings
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
+from taichi_mrf.datasets.derived import mended, resampled
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
-from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.plugs import plugs
-from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros.names import is_bag
-from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings, naming
+from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
+
+GROUP = "taichi_mrf.formats"
+
+OWN = {
+    name: f"taichi_mrf.datasets.rare:{name.upper()}"
+    for name in ("several_sensors", "stray_scanner", "record3d", "las", "ouster", "rtabmap")
+}
+"""This package's, as pyproject.toml declares them, for a checkout that is not installed."""
+
+
+@cache
+def plugs() -> tuple[tuple[Format, ...], tuple[str, ...]]:
+    """All plugs, this package's first, and a line about each that cannot be used."""
+    own = [EntryPoint(name, value, GROUP) for name, value in OWN.items()]
+    found = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    others = [point for point in found if OWN.get(point.name) != point.value]
+    formats, problems = [plug.load() for plug in own], []
+    for point in others:
+        try:
+            formats.append(_guarded(point.name, point.load()))
+        except Exception as error:  # whatever a module of others raises
+            problems.append(_problem(point.name, error))
+    return tuple(formats), tuple(problems)
+
+
+def _guarded(plug: str, found: Any) -> Format:
+    """A format of others, whose errors name its plug."""
+    if not isinstance(found, Format):
+        raise TypeError(f"it names {found!r}, which is no Format")
+
+    def recognises(path: Path) -> bool:
+        try:
+            return bool(found.recognises(path))
+        except Exception as error:
+            warnings.warn(_problem(plug, error), stacklevel=2)
+            return False
+
+    def open_source(path: Path, *options: Any) -> Dataset:
+        try:
+            return found.open(path, *options)
+        except (TaichiMRFError, OSError):
+            raise
+        except Exception as error:
+            raise DatasetError(f"{path}: {_problem(plug, error)}") from error
+
+    return replace(found, recognises=recognises, open=open_source)
+
+
+def _problem(plug: str, error: Exception) -> str:
+    return f"the plug {plug!r} ({GROUP}) cannot be used: {type(error).__name__}: {said(error)}"
+
 
 _NOT_ALONE = re.compile(r"(rgb|colou?r|left|right)s?([-_].*)?|.*[-_](rgb|colou?r)|rtabmap_.*", re.IGNORECASE)
 """Folders with a part of a recording, such as its colours."""

@@ -152,6 +152,15 @@ class TimedPoses:
             return None
         return interpolate(self.poses[after - 1], self.poses[after], (stamp - first) / (last - first))
 
+    def posed(
+        self, stamps: Sequence[float], options: ReadOptions, what: str, where: str, source: str
+    ) -> tuple[list[tuple[int, Pose]], list[str]]:
+        """The data (``what``) that have a pose near enough in time: :func:`within_gap`."""
+        gap = largest_gap(options)
+        return within_gap(
+            stamps, [self.at(each, gap) for each in stamps], gap, what, where, source, self.stamps
+        )
+
     def between(
         self, times: NDArray[np.float64], largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -8,8 +8,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
 from taichi_mrf.datasets.depth_scale import out_of_sight
-from taichi_mrf.datasets.derived import Derived
-from taichi_mrf.datasets.mended import Mended
+from taichi_mrf.datasets.derived import Derived, Mended
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
@@ -196,7 +195,7 @@ def _steps(sample: Sample) -> float:
 
 def _swapped_images(source: Dataset) -> Finding | None:
     """Finding if far more of a stereo recording's pixels match with the left and right images swapped."""
-    from taichi_mrf.datasets.stereo.pairs import StereoPairs  # late: few recordings are stereo
+    from taichi_mrf.datasets.stereo.matching import StereoPairs  # late: few recordings are stereo
 
     if not isinstance(source, StereoPairs) or not len(source):
         return None

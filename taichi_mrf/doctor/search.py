@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.conventions import AXES, POSE_UNITS
 from taichi_mrf.datasets.depth_scale import SeenAgain, seen_again
-from taichi_mrf.datasets.mended import pose_of
+from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
 from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View

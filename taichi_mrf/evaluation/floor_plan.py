@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.laser.plan_image import FloorPlan
-from taichi_mrf.datasets.laser.scans import LaserScans
+from taichi_mrf.datasets.laser.scans import FloorPlan, LaserScans
 
 
 @dataclass(frozen=True)

@@ -184,8 +184,7 @@ def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
 
 def _mesh_of(dataset: Dataset) -> TriangleMesh | None:
     # Imported late: most sequences are recorded, and have nothing of the kind.
-    from taichi_mrf.datasets.synthetic.mesh_scene import scene_mesh
-    from taichi_mrf.datasets.synthetic.mesh_sequence import MeshSequence
+    from taichi_mrf.datasets.synthetic.mesh_scene import MeshSequence, scene_mesh
     from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 
     if isinstance(dataset, SyntheticRoom):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taichi_mrf.datasets.laser.plan_image import FloorPlan
+from taichi_mrf.datasets.laser.scans import FloorPlan
 from taichi_mrf.evaluation.floor_plan import LaserMap
 from taichi_mrf.evaluation.pictures.laser_pictures import (
     METHOD_NAMES,

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taichi_mrf.datasets.laser.floor_plan_scans import FloorPlanOptions, simulate_scans
-from taichi_mrf.datasets.laser.plan_image import FloorPlan, read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.laser.scans import LaserScans
+from taichi_mrf.datasets.laser.scans import FloorPlan, LaserScans, read_floor_plan
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.floor_plan import (
     FREE,

@@ -9,8 +9,8 @@ import pytest
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.base import BuiltIn
+from taichi_mrf.datasets.derived import resampled
 from taichi_mrf.datasets.registry import BUILT_IN
-from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame

@@ -11,8 +11,7 @@ from refusals import refused
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.point_cloud import decode
+from taichi_mrf.datasets.ros.lidar import LidarBag, decode
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable

@@ -21,9 +21,8 @@ from inputs_bags import (
     writing,
 )
 
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, open_pose_source
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames, open_posed
-from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 

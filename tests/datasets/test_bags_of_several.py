@@ -26,7 +26,7 @@ from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.datasets.runs import starts_of_runs
+from taichi_mrf.datasets.ros.runs import starts_of_runs
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 

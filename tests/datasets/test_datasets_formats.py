@@ -27,8 +27,8 @@ from every_format import WHOLE_NUMBERS
 from rtabmap_database import rvl
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.formats.rtabmap import decode_depth
 from taichi_mrf.datasets.pose_sources.posed import open_posed
-from taichi_mrf.datasets.rtabmap.blobs import decode_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera

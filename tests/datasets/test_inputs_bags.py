@@ -31,7 +31,7 @@ from inputs_bags import (
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.rvl import decode_rvl
+from taichi_mrf.datasets.images import decode_rvl
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera

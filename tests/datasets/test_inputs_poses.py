@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from inputs_frames import slerp
 from scipy.spatial.transform import Rotation
 
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.ros.tf import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, interpolate, quaternion, read_timed_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse, look_at

@@ -12,7 +12,7 @@ from inputs_bags import matrix
 from refusals import refused
 
 from taichi_mrf.datasets import ReadOptions, open_dataset
-from taichi_mrf.datasets.resampled import strided
+from taichi_mrf.datasets.derived import strided
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.camera import PinholeCamera

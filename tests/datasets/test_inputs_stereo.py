@@ -9,8 +9,7 @@ from refusals import refused
 from stereo_rig import BASELINE, CAMERA, COUNT, pairs, pose, write
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
-from taichi_mrf.datasets.stereo.pairs import StereoPairs
+from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoPairs, stereo_depth
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.sensor.camera import PinholeCamera
 

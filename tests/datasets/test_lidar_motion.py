@@ -5,7 +5,7 @@ import pytest
 from moving_lidar import lidar
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.motion import Motion, Scan
+from taichi_mrf.datasets.lidar.scans import Motion, Scan
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.ray_table import RayTable

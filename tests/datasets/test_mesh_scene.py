@@ -13,8 +13,13 @@ from refusals import refused
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic import mesh_scene
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
-from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh, load_mesh, scene_mesh
-from taichi_mrf.datasets.synthetic.mesh_sequence import MeshSequence
+from taichi_mrf.datasets.synthetic.mesh_scene import (
+    MeshScene,
+    MeshSequence,
+    TriangleMesh,
+    load_mesh,
+    scene_mesh,
+)
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import look_at

@@ -22,11 +22,10 @@ from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from taichi_mrf.calibration.pairs import DepthFiles
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.image_header import claimed_size
-from taichi_mrf.datasets.images import read_color, read_depth, read_grey
+from taichi_mrf.datasets.images import claimed_size, read_color, read_depth, read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.ros import tolerance
-from taichi_mrf.datasets.ros.tolerance import bound_unpacking
+from taichi_mrf.datasets.ros import reader as tolerance
+from taichi_mrf.datasets.ros.reader import bound_unpacking
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 from taichi_mrf.export.octomap_reader import read_octomap

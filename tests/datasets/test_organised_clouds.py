@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.organised import by_ring, organised
+from taichi_mrf.datasets.ros.lidar import by_ring, organised
 from taichi_mrf.sensor.spherical import SphericalCamera
 
 ELEVATIONS = np.linspace(0.4, -0.3, 6)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.lidar.beams import NOMINAL_M, Beams
+from taichi_mrf.datasets.lidar.ouster import NOMINAL_M, Beams
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.origins import starts_at

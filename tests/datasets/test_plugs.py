@@ -13,7 +13,7 @@ import pytest
 from console import FAST, mapped, report_of
 
 from taichi_mrf.datasets.entries import FORMATS
-from taichi_mrf.datasets.plugs import GROUP, OWN, plugs
+from taichi_mrf.datasets.registry import GROUP, OWN, plugs
 
 try:
     import tomllib

@@ -13,9 +13,14 @@ from hypothesis import strategies as st
 from point_clouds import LasFile, Walk, las_head, lzf, write_pcd, write_ply
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.lidar.clouds import is_cloud, natural, read_cloud
-from taichi_mrf.datasets.lidar.pcd_file import read_pcd, unpack_lzf
-from taichi_mrf.datasets.lidar.ply_file import read_ply_points
+from taichi_mrf.datasets.lidar.clouds import (
+    is_cloud,
+    natural,
+    read_cloud,
+    read_pcd,
+    read_ply_points,
+    unpack_lzf,
+)
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 

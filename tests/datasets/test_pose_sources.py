@@ -14,12 +14,16 @@ from scipy.spatial.transform import Rotation
 from sliding_camera import CAMERA, sequence
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
+from taichi_mrf.datasets.pose_sources.base import (
+    SETTLES_S,
+    STAYS_BROKEN_S,
+    CallbackPoses,
+    ChangedPoses,
+    WatchedFile,
+    open_pose_source,
+)
 from taichi_mrf.datasets.pose_sources.graph_file import PoseGraph, read_pose_graph, write_pose_graph
-from taichi_mrf.datasets.pose_sources.matching import FramePoses
-from taichi_mrf.datasets.pose_sources.posed import open_posed, posed_by
-from taichi_mrf.datasets.pose_sources.registry import open_pose_source
-from taichi_mrf.datasets.pose_sources.watched import SETTLES_S, STAYS_BROKEN_S, WatchedFile
+from taichi_mrf.datasets.pose_sources.posed import FramePoses, open_posed, posed_by
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose

@@ -12,7 +12,7 @@ from refusals import refused
 
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.formats.record3d_files import held_bytes, unpacked
+from taichi_mrf.datasets.formats.record3d import held_bytes, unpacked
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.sensor.camera import PinholeCamera

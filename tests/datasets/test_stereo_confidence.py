@@ -9,7 +9,7 @@ from stereo_scene import Layer, render
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.stereo.confidence import (
+from taichi_mrf.datasets.stereo.matching import (
     BLOCK,
     MOVE_POWER,
     MOVE_RANGE_PX,
@@ -17,10 +17,12 @@ from taichi_mrf.datasets.stereo.confidence import (
     SPREAD_OFFSET_PX,
     SPREAD_POWER,
     SPREAD_RANGE_PX,
+    StereoMatching,
+    StereoPairs,
+    StereoRig,
     disparity_sigma,
+    stereo_disparity,
 )
-from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig, stereo_disparity
-from taichi_mrf.datasets.stereo.pairs import StereoPairs
 
 SHAPE = (80, 160)
 

@@ -13,8 +13,7 @@ from stereo_rig import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_kitt
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise, with_tuned_noise
-from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
-from taichi_mrf.datasets.stereo.pairs import StereoPairs
+from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoPairs, stereo_depth
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.analytic_scene import Solid, distance_to
-from taichi_mrf.datasets.synthetic.moving_room import PERIOD_S, SCRIPTS, moving_room
-from taichi_mrf.datasets.synthetic.moving_scene import (
+from taichi_mrf.datasets.synthetic.room import (
+    PERIOD_S,
+    SCRIPTS,
     Place,
     Stay,
+    SyntheticRoom,
     Thing,
     distance_to_solids,
+    moving_room,
     placed,
     way,
 )
-from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 
 VARIANTS = range(4)
 number = st.floats(-2, 2)

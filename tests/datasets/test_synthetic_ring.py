@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.synthetic.ring import OVERLAP_M, SmoothWay, SyntheticRing
+from taichi_mrf.datasets.synthetic.corridor import OVERLAP_M, SmoothWay, SyntheticRing
 from taichi_mrf.geometry.poses import as_pose, tangent_norms
 
 SMALL = "synthetic:ring?frames=60&width=80&height=60&noise=none"

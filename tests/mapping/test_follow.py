@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from sliding_camera import ALL_FRAMES, StopAfter, names, sequence
 
 from taichi_mrf.config.schema import Config, PoseConfig
-from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
+from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses, WatchedFile, open_pose_source
 from taichi_mrf.datasets.pose_sources.posed import posed_by
-from taichi_mrf.datasets.pose_sources.registry import open_pose_source
-from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.errors import CapacityError, ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.mapping import follow, pipeline

@@ -54,11 +54,11 @@ from taichi_mrf.calibration.truth_sources import read_stamps
 from taichi_mrf.config.schema import Config, VolumeConfig, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.formats.rtabmap import RtabmapRecording
 from taichi_mrf.datasets.images import read_grey
-from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
+from taichi_mrf.datasets.laser.scans import read_floor_plan
 from taichi_mrf.datasets.pose_sources.graph_file import read_pose_graph
-from taichi_mrf.datasets.rtabmap.recording import RtabmapRecording
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import FrameError, TaichiMRFError

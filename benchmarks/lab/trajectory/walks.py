@@ -18,10 +18,17 @@ from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
-from taichi_mrf.datasets.synthetic.corridor import corridor_scene, pose_on_way, waypoints
+from taichi_mrf.datasets.synthetic.corridor import (
+    LAMP_OVER_EYE_M,
+    SmoothWay,
+    corridor_scene,
+    pose_on_way,
+    ring_scene,
+    ring_way,
+    waypoints,
+)
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
 from taichi_mrf.datasets.synthetic.rendered_sequence import RenderOptions, mottled
-from taichi_mrf.datasets.synthetic.ring import LAMP_OVER_EYE_M, SmoothWay, ring_scene, ring_way
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.geometry.poses import Pose

@@ -28,15 +28,20 @@ from taichi_mrf.datasets.entries import NUMBERED_FILES, NUMBERED_IMAGE, numbered
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
 from taichi_mrf.datasets.hints import image_hint, pose_files_hint, unread_poses
 from taichi_mrf.datasets.images import holds_depth
-from taichi_mrf.datasets.intrinsics import CAMERA_FILES, find_camera, own_cameras
-from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.intrinsics import (
+    CAMERA_FILES,
+    find_camera,
+    is_trajectory_json,
+    own_cameras,
+    read_trajectory_json,
+)
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import in_seconds
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import RecordedFrame, first_file, recording
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
     RecordedPose,
     Trajectory,
+    in_seconds,
     is_trajectory,
     poses_at_start,
     read_trajectory,
@@ -85,16 +90,16 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     if recorded is not None and camera == recorded:
         assumed = []
         frames = [replace(frame, camera=each) for frame, each in zip(frames, own, strict=True)]
-    return Recording(
-        name=folder.name,
-        camera=camera,
-        notes=assumed + notes,
-        dropped=len(images) - len(frames),
-        rows=frames,
-        steps_per_metre=options.depth_scale or (1000.0 if trajectory.layout == "log" else 5000.0),
-        scale_source=ASKED if options.depth_scale else f"assumed as {name} has it",
+    return recording(
+        folder,
+        options,
+        camera,
+        frames,
+        1000.0 if trajectory.layout == "log" else 5000.0,
+        f"assumed as {name} has it",
+        assumed + notes,
+        len(images),
         scale_assumed=options.depth_scale is None,
-        color=options.color,
     )
 
 
@@ -175,14 +180,9 @@ def _frame(
     folder: Path, number: int, path: Path, trajectory: Trajectory, pose: RecordedPose | None, mirror: bool
 ) -> RecordedFrame:
     colors = (folder / place / f"{path.stem}{end}" for place in COLOR_FOLDERS for end in (".png", ".jpg"))
-    return RecordedFrame(
-        name=path.stem,
-        stamp=_stamp(path, number, trajectory),
-        depth_file=path,
-        pose=partial(_read_pose, trajectory.path, pose, mirror),
-        pose_source=str(trajectory.path) if pose is None else pose.source,
-        color_file=next((color for color in colors if color.is_file()), None),
-    )
+    source = str(trajectory.path) if pose is None else pose.source
+    read, stamp = partial(_read_pose, trajectory.path, pose, mirror), _stamp(path, number, trajectory)
+    return RecordedFrame(path.stem, stamp, read, source, path, first_file(colors))
 
 
 def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:

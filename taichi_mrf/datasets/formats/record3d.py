@@ -1,16 +1,25 @@
 """Recordings of the app Record3D: an iPhone's or iPad's lidar, with ARKit's poses and confidence.
 
-A ``.r3d``, which is a zip, or a folder with what is in it:
+A ``.r3d``, which is a zip, or a folder with what is in it, read without trust:
 
-- ``metadata``: cameras, stamps, and poses with x right, y up and z backwards (record3d_metadata.py)
+- ``metadata``: JSON. ``K`` are the 9 numbers of the colour camera's matrix, column by column; ``w`` and ``h``
+  the size that it is for; ``dw`` and ``dh`` the size of depth, which old files lack; ``poses`` qx qy qz qw tx
+  ty tz of each frame, with x right, y up and z backwards. ``fps``, ``frameTimestamps`` (seconds) and
+  ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each frame) may be missing
 - ``rgbd/N.depth``: float32 metres; ``rgbd/N.conf``: 8 bits, ARKit's levels 0 (low), 1 and 2 (high);
   both packed with LZFSE or as they are. ``rgbd/N.jpg``: the colour image, to which depth is registered
 
-Level 2 leaves the sigma, level 1 doubles it, and pixels of level 0 are no measurements.
+An LZFSE stream is a row of blocks, each of which says how many bytes it holds; they are added up before
+anything is unpacked. Unpacking needs the extra ``record3d``. Level 2 leaves the sigma, level 1 doubles it,
+and pixels of level 0 are no measurements.
 """
 
+import json
 import math
-from collections.abc import Sequence
+import struct
+import weakref
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,26 +28,257 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Row, Table, start_pose
+from taichi_mrf.datasets.base import NumberedRow, Table, start_pose
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.confidence import ARKIT
-from taichi_mrf.datasets.formats.record3d_files import (
-    Files,
-    held_bytes,
-    is_packed,
-    open_files,
-    unpacked,
-    unpacker,
-)
-from taichi_mrf.datasets.formats.record3d_metadata import MOST_PIXELS, Metadata, read_metadata
 from taichi_mrf.datasets.images import decode_color
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import DatasetError, naming
+from taichi_mrf.errors import ConfigError, DatasetError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import is_file
+from taichi_mrf.system.files import is_file, is_folder, open_regular, read_bytes
+from taichi_mrf.system.libraries import library
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.npz_file import DEFLATE_RATIO
+
+MISSING = "the file is missing"
+_LZFSE, _END = b"bvx", b"bvx$"
+_LEAST_HEADER = 32
+"""Bytes of an LZFSE block's header without its table of frequencies."""
+
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+class Files:
+    """The files of a recording by their names in it, such as ``rgbd/0.depth``: in a .r3d or in a folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises DatasetError, which names the file, if it is neither a folder nor a zip."""
+        self.path, self.zipped = path, not is_folder(path)
+        if not self.zipped:
+            inside = [path, *(child for child in path.iterdir() if is_folder(child))]
+            files = (file for folder in inside for file in folder.iterdir() if is_file(file))
+            self.names = frozenset(file.relative_to(path).as_posix() for file in files)
+            return
+        stream = open_regular(path, DatasetError)
+        try:
+            self._archive = zipfile.ZipFile(stream)
+        except Exception as error:  # zipfile raises many kinds of errors
+            stream.close()
+            raise DatasetError(f"{path}: not a recording of Record3D: {said(error)}") from error
+        self.names = frozenset(self._archive.NameToInfo)
+        weakref.finalize(self, stream.close)
+
+    def where(self, name: str) -> str:
+        """Name of a file in errors."""
+        return f"{self.path}: {name}" if self.zipped else str(self.path / name)
+
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """A file's content. Raises DatasetError, which names the file, if it is missing, damaged or larger
+        than ``most_bytes``."""
+        if not self.zipped:
+            return read_bytes(self.path / name, DatasetError, MISSING, most_bytes)
+        if name not in self.names:
+            raise DatasetError(f"{self.where(name)}: {MISSING}")
+        info = self._archive.getinfo(name)
+        size = info.file_size
+        if size > most_bytes or size > DEFLATE_RATIO * (info.compress_size + 1):
+            raise DatasetError(
+                f"{self.where(name)}: claims {size:,} bytes; at most {most_bytes:,} are expected"
+            )
+        if info.compress_type not in _METHODS:
+            raise DatasetError(
+                f"{self.where(name)}: is packed by the method {info.compress_type}, not by deflate"
+            )
+        check_memory(size, self.where(name))
+        try:
+            return self._archive.read(info)
+        except Exception as error:
+            raise DatasetError(f"{self.where(name)}: cannot be read: {said(error)}") from error
+
+
+def is_packed(data: bytes) -> bool:
+    """True if the content of a file of depth or confidence is an LZFSE stream."""
+    return data.startswith(_LZFSE)
+
+
+def unpacker() -> Any:
+    """The library that unpacks LZFSE. Raises DatasetError, which says what to install."""
+    return library("lzfse", "depth that Record3D has packed needs", "record3d", DatasetError)
+
+
+def held_bytes(data: bytes) -> int:
+    """How many bytes the content of a file of depth or confidence has, unpacked. Raises DatasetError, which
+    names no file, for an LZFSE stream that is damaged."""
+    if not is_packed(data):
+        return len(data)
+    place = total = 0
+    try:
+        while data[place : place + 4] != _END:
+            kind, held = struct.unpack_from("<4sI", data, place)
+            total += held
+            place += _block_bytes(kind, held, data, place)
+    except struct.error:
+        raise DatasetError("is cut short") from None
+    return total
+
+
+def unpacked(data: bytes, expected_bytes: int) -> bytes:
+    """The content of a file of depth or confidence. Raises DatasetError, which names no file, if it is
+    damaged or holds another number of bytes than expected, and what to install if it is packed and the
+    library is missing."""
+    held = held_bytes(data)
+    if held != expected_bytes:
+        raise DatasetError(f"holds {held:,} bytes, expected {expected_bytes:,}")
+    if not is_packed(data):
+        return data
+    lzfse = unpacker()
+    try:
+        content: bytes = lzfse.decompress(data)
+    except Exception as error:
+        raise DatasetError("is damaged, it cannot be unpacked") from error
+    if len(content) != expected_bytes:
+        raise DatasetError(f"unpacks to {len(content):,} bytes, expected {expected_bytes:,}")
+    return content
+
+
+def _block_bytes(kind: bytes, held: int, data: bytes, place: int) -> int:
+    """The size of a block of an LZFSE stream with its header."""
+    if kind == b"bvx-":  # as it is
+        return 8 + held
+    if kind == b"bvxn":  # LZVN
+        return 12 + int(struct.unpack_from("<I", data, place + 8)[0])
+    if kind == b"bvx2":  # the sizes of literals and matches are fields of 20 bits
+        literals, matches, header = struct.unpack_from("<QQI", data, place + 8)
+        if header >= _LEAST_HEADER:
+            return int(header + (literals >> 20 & 0xFFFFF) + (matches >> 40 & 0xFFFFF))
+    raise DatasetError(f"holds an unknown block, {kind!r}: it is damaged")
+
+
+MOST_PIXELS = 1 << 24
+"""Of a depth image; those of phones have 49,152 or 307,200."""
+
+FRAMES_PER_SECOND = 30.0
+"""Assumed where nothing tells."""
+
+_LEAST_RATE, _LARGEST_RATE = 1e-3, 1e6
+
+_NO_POSE = np.array([0.0, 0, 0, 1, 0, 0, 0])
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Content of the metadata. ``where`` is what errors call them, ``depth_shape`` (height, width), None if
+    it is missing; ``poses`` is (N, 7), ``intrinsics`` (N, 4), both with no row if they are missing."""
+
+    where: str
+    values: Mapping[str, Any]
+    color_camera: PinholeCamera
+    depth_shape: tuple[int, int] | None
+    poses: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+
+    @property
+    def has_poses(self) -> bool:
+        """True if any frame has a pose other than the origin, which all have without tracking."""
+        return len(self.poses) == 1 or not bool(np.all(self.poses == _NO_POSE))
+
+    def cameras(self, numbers: Sequence[int]) -> list[PinholeCamera] | None:
+        """The colour camera of each of these frames, None if one is that of all. Raises DatasetError."""
+        if len(self.intrinsics) == 0:
+            return None
+        name, size = "perFrameIntrinsicCoeffs", (self.color_camera.width, self.color_camera.height)
+        if len(self.intrinsics) <= max(numbers):
+            raise DatasetError(
+                f"{self.where}: {name} has {len(self.intrinsics)} entries, none for frame {max(numbers)}"
+            )
+        # Zeros stand for intrinsics that are not known.
+        known = np.flatnonzero(self.intrinsics.any(axis=1))
+        if len(known) == 0:
+            return None
+        rows = known[np.maximum(np.searchsorted(known, numbers, "right") - 1, 0)]
+        with naming(f"{self.where}: {name}", ConfigError):
+            return [PinholeCamera(*size, *map(float, self.intrinsics[row])) for row in rows]
+
+    def stamps(self, numbers: Sequence[int]) -> tuple[list[float], list[str]]:
+        """When each of these frames was taken, in seconds, and notes. Raises DatasetError."""
+        times, rate = self.values.get("frameTimestamps"), self.values.get("fps")
+        if times:
+            try:
+                stamps = [float(times[number]) for number in numbers]
+            except (ValueError, TypeError, IndexError, KeyError, OverflowError):
+                stamps = []
+            if len(stamps) < len(numbers) or not all(map(math.isfinite, stamps)):
+                raise DatasetError(f"{self.where}: frameTimestamps is no list of a number for each frame")
+            return stamps, []
+        if isinstance(rate, int | float) and _LEAST_RATE <= rate <= _LARGEST_RATE:
+            return [number / rate for number in numbers], []
+        note = f"no stamps in {self.where}: assumed {FRAMES_PER_SECOND:g} frames a second"
+        return [number / FRAMES_PER_SECOND for number in numbers], [note]
+
+
+def read_metadata(where: str, data: bytes) -> Metadata:
+    """The metadata in a file. Raises DatasetError, which begins with ``where`` and names the entry."""
+    try:
+        values = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{where}: not valid JSON: {said(error)}") from error
+    if not isinstance(values, dict):
+        raise DatasetError(f"{where}: expected an object with K, w, h and poses")
+    shape = None
+    if "dw" in values or "dh" in values:
+        shape = _whole(where, values, "dh"), _whole(where, values, "dw")
+        if shape[0] * shape[1] > MOST_PIXELS:
+            raise DatasetError(
+                f"{where}: {shape[1]} x {shape[0]} pixels of depth; at most {MOST_PIXELS:,} are read"
+            )
+    return Metadata(
+        where,
+        values,
+        _color_camera(where, values),
+        shape,
+        _table(where, values, "poses", 7),
+        _table(where, values, "perFrameIntrinsicCoeffs", 4),
+    )
+
+
+def _color_camera(where: str, values: Mapping[str, Any]) -> PinholeCamera:
+    width, height = _whole(where, values, "w"), _whole(where, values, "h")
+    K = _numbers(values.get("K"))
+    if K.shape != (9,) or not np.isfinite(K).all():
+        raise DatasetError(f"{where}: K is no list of 9 numbers")
+    with naming(f"{where}: K", ConfigError):
+        return PinholeCamera.from_matrix(width, height, K.reshape(3, 3).T)
+
+
+def _table(where: str, values: Mapping[str, Any], name: str, columns: int) -> NDArray[np.float64]:
+    """A list of lists of as many numbers, (N, columns), without a row if it is missing."""
+    found = values.get(name)
+    table = _numbers(found) if found else np.empty((0, columns))
+    if table.ndim != 2 or table.shape[1] != columns:
+        raise DatasetError(f"{where}: {name} is no list of {columns} numbers for each frame")
+    return table
+
+
+def _numbers(found: Any) -> NDArray[np.float64]:
+    """Numbers of JSON as an array, of no dimension if they are anything else."""
+    try:
+        return np.array(found, np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return np.array(np.nan)
+
+
+def _whole(where: str, values: Mapping[str, Any], name: str) -> int:
+    """A number of pixels."""
+    found = values.get(name)
+    if isinstance(found, float) and found.is_integer():
+        found = int(found)
+    if not isinstance(found, int) or isinstance(found, bool) or not 0 < found <= MOST_PIXELS:
+        raise DatasetError(f"{where}: {name} is {str(found)[:40]}, which is no number of pixels")
+    return found
+
 
 METADATA, IMAGES = "metadata", "rgbd"
 _MOST_METADATA, _MOST_IMAGE = 1 << 27, 1 << 26
@@ -46,15 +286,8 @@ _MOST_DIGITS = 9
 _ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True)
-class Record3DFrame(Row):
-    """A frame and its number."""
-
-    number: int
-
-
 @dataclass
-class Record3D(Table[Record3DFrame]):
+class Record3D(Table[NumberedRow]):
     """The frames of a recording. ``cameras`` are those of their colour images, where
     each has its own; None if one holds for all, as the caller's does."""
 
@@ -65,7 +298,7 @@ class Record3D(Table[Record3DFrame]):
     steps_per_metre: float = 1.0
     color: bool = True
 
-    def load(self, index: int, row: Record3DFrame, T_world_camera: Pose) -> Frame:
+    def load(self, index: int, row: NumberedRow, T_world_camera: Pose) -> Frame:
         """Read depth, confidence and colour, which must have the sizes that they should."""
         number, own = row.number, None if self.cameras is None else self.cameras[index]
         camera = self.camera if own is None else _of_depth(own, self.camera.shape)
@@ -113,7 +346,7 @@ class Record3D(Table[Record3DFrame]):
 def open_recording(path: Path, options: ReadOptions) -> Record3D:
     """List the frames in the order of their numbers. Raises DatasetError, which names the file and the entry
     of its metadata, also for a recording without poses, unless they are to be tracked."""
-    files = open_files(path)
+    files = Files(path)
     numbers = sorted(number for name in files.names if (number := _number_of(name)) is not None)
     if not numbers:
         raise DatasetError(f"{path}: contains no {IMAGES}/N.depth")
@@ -149,9 +382,9 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
     )
 
 
-def _row(metadata: Metadata, number: int, stamp: float) -> Record3DFrame:
+def _row(metadata: Metadata, number: int, stamp: float) -> NumberedRow:
     pose = partial(_pose, metadata.poses[number]) if metadata.has_poses else start_pose()
-    return Record3DFrame(f"{number:06d}", stamp, pose, f"{metadata.where}: pose {number}", number)
+    return NumberedRow(f"{number:06d}", stamp, pose, f"{metadata.where}: pose {number}", number)
 
 
 def _pose(values: NDArray[np.float64]) -> Pose:

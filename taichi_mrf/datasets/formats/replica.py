@@ -12,9 +12,9 @@ from pathlib import Path
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import RecordedFrame, first_file, recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
 
@@ -39,34 +39,21 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
             f"{folder / POSES}: expected a 4 x 4 matrix in each of {len(images)} lines, one for each depth "
             f"image, found {len(trajectory.poses)} poses"
         )
-    parameters = next((p for p in (folder / PARAMETERS, folder.parent / PARAMETERS) if p.is_file()), None)
+    parameters = first_file((folder / PARAMETERS, folder.parent / PARAMETERS))
     recorded, steps = (CAMERA, STEPS_PER_METRE) if parameters is None else _read_parameters(parameters)
     camera, notes = find_camera(folder, options, recorded, NAME, iter(images))
     if parameters is not None and camera == recorded:
         notes = []
-    return Recording(
-        name=folder.name,
-        camera=camera,
-        notes=notes,
-        rows=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
-        steps_per_metre=options.depth_scale or steps,
-        scale_source=ASKED if options.depth_scale else str(parameters or NAME),
-        scale_stated=parameters is not None,
-        color=options.color,
-    )
+    rows = [_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)]
+    source, stated = str(parameters or NAME), parameters is not None
+    return recording(folder, options, camera, rows, steps, source, notes, scale_stated=stated)
 
 
 def _frame(path: Path, pose: RecordedPose) -> RecordedFrame:
     number = path.stem.removeprefix("depth")
-    colors = (path.with_name(f"frame{number}{suffix}") for suffix in (".jpg", ".png"))
-    return RecordedFrame(
-        name=path.stem,
-        stamp=int(number) / FRAMES_PER_SECOND,
-        depth_file=path,
-        pose=pose.T_world_camera,
-        pose_source=pose.source,
-        color_file=next((color for color in colors if color.is_file()), None),
-    )
+    color_file = first_file(path.with_name(f"frame{number}{suffix}") for suffix in (".jpg", ".png"))
+    stamp = int(number) / FRAMES_PER_SECOND
+    return RecordedFrame(path.stem, stamp, pose.T_world_camera, pose.source, path, color_file)
 
 
 def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
@@ -74,12 +61,11 @@ def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
     text = read_text(path, DatasetError)
     try:
         values = json.loads(text)["camera"]
-        intrinsics = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        camera, scale = PinholeCamera(int(values["w"]), int(values["h"]), *intrinsics), float(values["scale"])
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
+        intrinsics = [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
+        size, scale = (int(values["w"]), int(values["h"])), float(values["scale"])
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         raise DatasetError(f"{path}: camera needs the numbers w, h, fx, fy, cx, cy and scale") from None
     if not 0 < scale < float("inf"):
         raise DatasetError(f"{path}: scale must be a positive number of steps per metre, not {scale:g}")
-    return camera, scale
+    with naming(path, ConfigError):
+        return PinholeCamera(*size, *intrinsics), scale

@@ -11,6 +11,7 @@ a file that is missing stands for the identity.
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import LOST, RecordedFrame, first_file, recording
 from taichi_mrf.datasets.trajectories import is_lost, read_matrix_file
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, inverse
@@ -71,18 +72,16 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     color_camera = _color_camera(folder, frames) if options.color else None
     if color_camera is None and options.color and any(frame.color_file for frame in frames):
         notes.append(f"colours are not read: there is no {folder / COLOR_INTRINSICS}")
-    dropped = len(images) - len(tracked)
-    if dropped:
-        notes.append(f"{dropped} of {len(images)} images dropped: tracking was lost")
-    return Recording(
-        name=folder.name,
-        camera=camera,
-        notes=notes,
-        dropped=dropped,
-        rows=frames,
-        steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source=ASKED if options.depth_scale else NAME,
-        color=color_camera is not None,
+    return recording(
+        folder,
+        replace(options, color=color_camera is not None),
+        camera,
+        frames,
+        STEPS_PER_METRE,
+        NAME,
+        notes,
+        len(images),
+        LOST,
         color_camera=color_camera,
     )
 
@@ -119,13 +118,6 @@ def _own_camera(folder: Path, image: Path) -> PinholeCamera | None:
 
 def _frame(folder: Path, path: Path, camera: PinholeCamera | None) -> RecordedFrame:
     pose_file = folder / "pose" / f"{path.stem}.txt"
-    colors = (folder / "color" / f"{path.stem}.{suffix}" for suffix in ("jpg", "png"))
-    return RecordedFrame(
-        name=path.stem,
-        stamp=int(path.stem) / FRAMES_PER_SECOND,
-        depth_file=path,
-        pose=partial(read_matrix_file, pose_file),
-        pose_source=str(pose_file),
-        color_file=next((color for color in colors if color.is_file()), None),
-        camera=camera,
-    )
+    color_file = first_file(folder / "color" / f"{path.stem}.{suffix}" for suffix in ("jpg", "png"))
+    read, stamp = partial(read_matrix_file, pose_file), int(path.stem) / FRAMES_PER_SECOND
+    return RecordedFrame(path.stem, stamp, read, str(pose_file), path, color_file, camera=camera)

@@ -17,7 +17,7 @@ from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import LOST, RecordedFrame, first_file, recording
 from taichi_mrf.datasets.trajectories import is_lost, read_matrix_file
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -61,30 +61,23 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         raise DatasetError(f"{folder}: tracking was lost in all {len(numbers)} images")
     frames = [_frame(folder, name, numbers[name]) for name in sorted(tracked, key=lambda n: (numbers[n], n))]
     camera, notes = find_camera(folder, options, CAMERA, NAME, (frame.depth_file for frame in frames))
-    dropped = len(numbers) - len(tracked)
-    if dropped:
-        notes.append(f"{dropped} of {len(numbers)} images dropped: tracking was lost")
-    return Recording(
-        name=folder.name,
-        camera=camera,
-        notes=notes,
-        dropped=dropped,
-        rows=frames,
-        steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source=ASKED if options.depth_scale else NAME,
-        color=options.color,
-        color_camera=COLOR if camera == CAMERA else None,
+    color = COLOR if camera == CAMERA else None
+    return recording(
+        folder,
+        options,
+        camera,
+        frames,
+        STEPS_PER_METRE,
+        NAME,
+        notes,
+        len(numbers),
+        LOST,
+        color_camera=color,
     )
 
 
 def _frame(folder: Path, name: str, number: int) -> RecordedFrame:
-    pose_file = folder / f"{name}.pose.txt"
-    colors = (folder / f"{name}.color.{suffix}" for suffix in ("png", "jpg"))
-    return RecordedFrame(
-        name=name,
-        stamp=number / FRAMES_PER_SECOND,
-        depth_file=folder / f"{name}.depth.png",
-        pose=partial(read_matrix_file, pose_file),
-        pose_source=str(pose_file),
-        color_file=next((path for path in colors if path.is_file()), None),
-    )
+    pose_file, depth_file = folder / f"{name}.pose.txt", folder / f"{name}.depth.png"
+    color_file = first_file(folder / f"{name}.color.{suffix}" for suffix in ("png", "jpg"))
+    read, stamp = partial(read_matrix_file, pose_file), number / FRAMES_PER_SECOND
+    return RecordedFrame(name, stamp, read, str(pose_file), depth_file, color_file)

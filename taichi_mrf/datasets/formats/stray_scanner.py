@@ -12,6 +12,7 @@ a film, which is not read.
 """
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,13 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import RecordedFrame, first_file, recording
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import is_file, read_text
+from taichi_mrf.system.files import read_text
 
+NAME = "Stray Scanner"
 DEPTH, CONFIDENCE, MATRIX, ODOMETRY = "depth", "confidence", "camera_matrix.csv", "odometry.csv"
 COLOR_SIZE, DEPTH_WIDTH = (1920, 1440), 256
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -42,32 +44,16 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     own = own_cameras([poses[number].camera for number in posed], options)
     for number, camera in zip(posed, own, strict=True):
         path, pose = images[number], poses[number]
-        confidence = folder / CONFIDENCE / path.name
+        files = path, None, first_file([folder / CONFIDENCE / path.name])
         frames.append(
-            RecordedFrame(
-                path.stem,
-                pose.key,
-                pose.T_world_camera,
-                pose.source,
-                path,
-                confidence_file=confidence if is_file(confidence) else None,
-                camera=camera,
-            )
+            RecordedFrame(path.stem, pose.key, pose.T_world_camera, pose.source, *files, camera=camera)
         )
     if not frames:
         raise DatasetError(f"{folder / ODOMETRY}: has a pose for none of the {len(images)} images in {DEPTH}")
-    dropped = len(images) - len(frames)
-    notes = [f"{dropped} of {len(images)} images dropped: {ODOMETRY} has no pose for them"] if dropped else []
-    return Recording(
-        name=folder.name,
-        camera=options.camera or own[0] or _camera(folder / MATRIX),
-        notes=notes,
-        dropped=dropped,
-        rows=frames,
-        steps_per_metre=options.depth_scale or 1000.0,
-        scale_source=ASKED if options.depth_scale else "Stray Scanner",
-        color=False,
-        confidence=ARKIT,
+    camera, why = options.camera or own[0] or _camera(folder / MATRIX), f"{ODOMETRY} has no pose for them"
+    depth_alone = replace(options, color=False)
+    return recording(
+        folder, depth_alone, camera, frames, 1000.0, NAME, [], len(images), why, confidence=ARKIT
     )
 
 

@@ -18,15 +18,14 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.pose_text import stamps_a_second
-from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import RecordedFrame, recording
 from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
-    RecordedPose,
     is_trajectory,
     poses_at_start,
     read_trajectory,
+    stamps_a_second,
 )
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -76,7 +75,10 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         )
     lost = len(trajectory.poses) - len(known)
     colors = _colors(folder, [stamp for stamp, _, _ in matched], options, gap)
-    frames = [_frame(*parts, color) for parts, color in zip(matched, colors, strict=True)]
+    frames = [
+        RecordedFrame(path.stem, stamp, pose.T_world_camera, pose.source, path, color)
+        for (stamp, path, pose), color in zip(matched, colors, strict=True)
+    ]
     default, default_name = _default_camera(folder)
     camera, notes = find_camera(folder, options, default, default_name, (f.depth_file for f in frames))
     dropped = len(depth) - len(frames)
@@ -84,16 +86,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes.append(f"{lost} of {len(trajectory.poses)} poses of {poses.name} left out: tracking was lost")
     if dropped:
         notes.append(f"{dropped} of {len(depth)} depth images dropped: no unused pose within {gap:g} s")
-    return Recording(
-        name=folder.name,
-        camera=camera,
-        notes=notes,
-        dropped=dropped,
-        rows=frames,
-        steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source=ASKED if options.depth_scale else NAME,
-        color=options.color,
-    )
+    return recording(folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(depth))
 
 
 def _poses(folder: Path, may_lack: bool) -> Path:
@@ -133,17 +126,6 @@ def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: flo
             partner[i] = j
             taken.add(j)
     return partner
-
-
-def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path | None) -> RecordedFrame:
-    return RecordedFrame(
-        name=depth_file.stem,
-        stamp=stamp,
-        depth_file=depth_file,
-        pose=pose.T_world_camera,
-        pose_source=pose.source,
-        color_file=color_file,
-    )
 
 
 def _colors(folder: Path, stamps: list[float], options: ReadOptions, gap: float) -> list[Path | None]:

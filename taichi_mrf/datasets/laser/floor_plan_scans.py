@@ -15,10 +15,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.laser.plan_image import FloorPlan
-from taichi_mrf.datasets.laser.scans import LaserScans
-from taichi_mrf.datasets.options import parse_options
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.config.values import check_field
+from taichi_mrf.datasets.laser.scans import FloorPlan, LaserScans
+from taichi_mrf.datasets.options import parse_options, require
+from taichi_mrf.errors import DatasetError
 
 DOOR_WIDTH = 1.0
 WALL = 0.2
@@ -166,15 +166,12 @@ class FloorPlanOptions:
     """Starts the random numbers; a scan's noise depends on this and its index alone."""
 
     def __post_init__(self) -> None:
-        for name, least in (("scans", 1), ("beams", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} must be at least {least}, not {getattr(self, name)}")
-        if not 0 < self.field_of_view <= 360:
-            raise ConfigError(f"field_of_view must be up to 360 degrees, not {self.field_of_view}")
-        if not 0 < self.max_range < math.inf:
-            raise ConfigError(f"max_range must be a positive number of metres, not {self.max_range}")
-        if not 0 <= self.noise < math.inf:
-            raise ConfigError(f"noise must be a number of metres, not {self.noise}")
+        require(self, scans=1, beams=1, seed=0)
+        angle, reach_m, noise_m = self.field_of_view, self.max_range, self.noise
+        check_field(0 < angle <= 360, "field_of_view", f"must be up to 360 degrees, not {angle}")
+        positive = 0 < reach_m < math.inf
+        check_field(positive, "max_range", f"must be a positive number of metres, not {reach_m}")
+        check_field(0 <= noise_m < math.inf, "noise", f"must be a number of metres, not {noise_m}")
 
 
 def open_floor_plan(source: str) -> LaserScans:

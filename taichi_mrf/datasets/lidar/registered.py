@@ -9,6 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.conventions import Conventions
+from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 
@@ -105,6 +107,14 @@ def of_sensor(points: Points, T_world_sensor: Pose) -> Points:
     with np.errstate(invalid="ignore", over="ignore"):
         moved: Points = points @ T[:3, :3].T + T[:3, 3]
     return moved
+
+
+def read_of_sensor(
+    read: Callable[[], Points], in_world: bool | None, conventions: Conventions, T_recorded: Pose
+) -> Points:
+    """The points of a scan in the sensor's frame, into which those of the world's are taken."""
+    points_m = read()
+    return of_sensor(points_m, pose_of(T_recorded, conventions)) if in_world else points_m
 
 
 def finite(points: Points) -> Points:

@@ -5,6 +5,9 @@ poses are used; the point clouds of a lidar, where there are no depth images or 
 (lidar.py). On opening, the stamp of each message is read; images are decoded when their frame is read. A pose
 is interpolated between its neighbours in time, and an image that has none near enough is left out and
 counted. ``poses=track`` finds all poses from the images while mapping. Reading needs the extra ``ros``.
+
+A summary lists the contents of a bag for a user who wants to map it: topics, frames, and the options that
+choose them.
 """
 
 import weakref
@@ -19,30 +22,28 @@ from taichi_mrf.datasets.base import Dataset, Table, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
+from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.images import note_of_largest
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
-from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.cameras import BagCameras, find_cameras
-from taichi_mrf.datasets.ros.color import BagColors, find_colors
-from taichi_mrf.datasets.ros.confidence import BagConfidence, find_confidence
-from taichi_mrf.datasets.ros.imu import BagImu, find_imu
+from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
-from taichi_mrf.datasets.ros.poses import PoseChoice
-from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader
-from taichi_mrf.datasets.ros.sensor import find_sensor, posed_by, poses_of
+from taichi_mrf.datasets.ros.poses import PoseChoice, pose_candidates
+from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader, Topic
+from taichi_mrf.datasets.ros.sensor import BagCameras, find_cameras, find_sensor, posed_by, poses_of
+from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
     choose,
     cloud_topics,
     depth_topics,
     described,
+    message_frame,
     no_depth,
     packed_otherwise,
 )
-from taichi_mrf.datasets.timed_poses import largest_gap
+from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -98,8 +99,8 @@ class RosBag(Table[BagRow]):
     topic: str = field(kw_only=True)
     cameras: BagCameras = field(kw_only=True)
     depth_scale: float | None = None
-    colors: BagColors | None = None
-    confidences: BagConfidence | None = None
+    colors: Beside | None = None
+    confidences: Beside | None = None
     gyro: GyroSamples | None = None
     acceleration: AccelerationSamples | None = None
 
@@ -204,15 +205,15 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     posed, notes = posed_by(sensor, found, options)
     dropped = len(sensor.entries) - len(posed)
     stamps, colors = [entry.stamp for _, entry, _ in posed], None
-    parts = (depth, cameras.first, stamps, options.max_time_gap, sensor)
+    parts = (depth, cameras.first, stamps, options.max_time_gap)
     if options.color:
-        colors, said = find_colors(reader, chosen.color, *parts)
+        colors, said = find_colors(sensor, chosen.color, *parts)
         notes += said
-    confidence, said = find_confidence(reader, chosen.confidence, *parts)
+    confidence, said = find_confidence(sensor, chosen.confidence, *parts)
     notes += said + cameras.notes
     tracked, imu = chosen.poses == TRACK, BagImu()
     if tracked:
-        imu = find_imu(reader, chosen.imu, sensor, stamps[0])
+        imu = find_imu(sensor, chosen.imu, stamps[0])
         posed = [(i, entry, start_pose(imu.up)) for i, entry, _ in posed]
         notes += imu.notes
     bag = RosBag(
@@ -242,9 +243,9 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
 def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
     refuse_image_options(f"{reader.path}", options)
     topic = choose(reader, "points", chosen.points, cloud_topics(reader), "topics of point clouds")
-    if reader.topics[topic].type != POINT_CLOUD:
+    if reader.topics[topic].type != messages.POINT_CLOUD:
         raise DatasetError(
-            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {POINT_CLOUD}"
+            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {messages.POINT_CLOUD}"
         )
     sensor = find_sensor(reader, topic, "clouds", chosen)
     found = poses_of(sensor, chosen)
@@ -285,3 +286,84 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     with naming(f"{reader.path}: topic {name}"):
         messages.check_depth(topic.encoding)
     return topic
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """The contents of a bag.
+
+    ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the tree's edges
+    in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to add; the first
+    needs the least to be filled in.
+    """
+
+    topics: Sequence[Topic]
+    remarks: dict[str, str]
+    duration: float
+    transforms: Sequence[str]
+    sources: Sequence[str]
+    flags: str
+
+    def rate(self, topic: Topic) -> float | None:
+        """Messages of a topic in a second, None if there are too few."""
+        return (topic.messages - 1) / self.duration if topic.messages > 1 and self.duration > 0 else None
+
+
+def summarise(path: Path) -> BagSummary:
+    """Look into a bag. Raises DatasetError, whose text names the file, if it cannot be read."""
+    reader = RosReader(path)
+    try:
+        topics = list(reader.topics.values())
+        if any(topic.name.startswith(REALSENSE) for topic in topics):
+            return BagSummary(topics, {}, reader.duration, [], [f"realsense:{path}?poses=FILE"], "")
+        depth, sent = depth_topics(reader), read_transforms(reader)
+        remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
+        clouds = {name: message_frame(reader, name) for name in cloud_topics(reader)}
+        remarks |= {name: f"points, frame {frame or 'unnamed'}" for name, frame in clouds.items()}
+        frames = clouds | {each.name: each.frame for each in depth} or {"": ""}
+        trees = {name: _tree_or_none(sent, name, frame) for name, frame in frames.items()}
+        chosen = {each.name: [f"depth={each.name}"] * (len(depth) > 1) for each in depth}
+        for each in depth:
+            chosen[each.name] += [f"info={each.info[0]}"] if len(each.info) > 1 else []
+        chosen |= {name: [f"points={name}"] * (bool(depth) or len(clouds) > 1) for name in clouds}
+        return BagSummary(
+            topics,
+            remarks,
+            reader.duration,
+            list(dict.fromkeys(words for tree in trees.values() for words in _transforms(tree))),
+            [each for name, of in chosen.items() for each in _sources(reader, trees[name], frames[name], of)],
+            "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
+        )
+    finally:
+        reader.close()
+
+
+def _tree_or_none(sent: dict[str, Transforms], topic: str, frame: str) -> TransformTree:
+    """The tree of a topic, without frames if the user must choose among several."""
+    try:
+        return tree_of(sent, topic, frame)
+    except DatasetError:
+        return TransformTree({})
+
+
+def _transforms(tree: TransformTree) -> list[str]:
+    words = []
+    for child, (parent, edge) in sorted(tree.edges.items()):
+        moving = f"moving, {len(edge)} times" if isinstance(edge, TimedPoses) else "fixed"
+        words.append(f"{parent} -> {child} ({moving})")
+    return words + [dispute.problem for dispute in tree.disputed.values()]
+
+
+def _pose_options(reader: RosReader, tree: TransformTree, frame: str) -> list[list[str]]:
+    """For each source of poses the options that choose it."""
+    try:
+        poses = [f"pose={name}" for name in pose_candidates(reader, tree, frame)]
+    except DatasetError:  # frames that form a cycle
+        poses = []
+    return [[]] if len(poses) == 1 else [[pose] for pose in poses or ["poses=FILE"]]
+
+
+def _sources(reader: RosReader, tree: TransformTree, frame: str, chosen: list[str]) -> list[str]:
+    """The source's name with the options that have to be ``chosen`` for a topic, for each source of poses."""
+    found = [[*chosen, *pose] for pose in _pose_options(reader, tree, frame)]
+    return [f"{reader.path}?{'&'.join(options)}" if options else str(reader.path) for options in found]

@@ -15,16 +15,18 @@ from taichi_mrf.datasets.images import (
     PNG_SIGNATURE,
     decode_16_bit,
     decode_color,
+    decode_rvl,
     measured,
     share_of_largest,
 )
-from taichi_mrf.datasets.rvl import decode_rvl
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 
-IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+IMAGES = (IMAGE, "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"

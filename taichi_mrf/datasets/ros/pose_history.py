@@ -24,16 +24,15 @@ from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
-from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
+from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     FROM_TF,
     choose,
     cloud_topics,
     depth_topics,
     message_frame,
-    path_topics,
+    topics_of,
 )
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import as_pose
@@ -88,7 +87,7 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
     run = sensor.run if sensor else BagRun()
     tree = sensor.tree() if sensor else tree_of(read_transforms(reader), "", optical, choice.tf)
     tree = tree.towards(choice.frame, choice.body)
-    paths = path_topics(reader)
+    paths = topics_of(reader, messages.PATH)
     wanted = choice.pose
     if not wanted and len(paths) != 1:
         others = pose_candidates(reader, tree, optical) if optical else []

@@ -10,6 +10,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,8 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
-from taichi_mrf.datasets.ros.tf import alternates
-from taichi_mrf.datasets.ros.topics import FROM_TF, choose, path_topics, pose_topics
-from taichi_mrf.datasets.ros.transform_tree import WORLDS, TransformTree
+from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
+from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -84,9 +84,9 @@ def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> lis
     topics also if transforms that may move do not. Raises DatasetError if there are none because publishers
     disagree."""
     root = tree.ancestors(optical)[-1]
-    topics = [name for name in pose_topics(reader) if not _is_apart(name, tree)]
+    topics = [name for name in topics_of(reader, *messages.POSES) if not _is_apart(name, tree)]
     if not topics and not tree.moves(root, optical):
-        topics = [name for name in path_topics(reader) if not _is_apart(name, tree)]
+        topics = [name for name in topics_of(reader, messages.PATH) if not _is_apart(name, tree)]
     if not topics:
         tree.check(optical)
     by_tf = tree.moves(root, optical) and (not topics or tree.mounted(root, optical) is None)
@@ -126,7 +126,7 @@ def find_poses(
         return _of_body(reader, tree, optical, below, choice)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
-        others = [name for name in pose_topics(reader) if _is_apart(name, tree)]
+        others = [name for name in topics_of(reader, *messages.POSES) if _is_apart(name, tree)]
         if others:
             problem += f". Those of other robots: ?pose={' or ?pose='.join(others)}"
         if tree.frames and optical not in tree.frames:
@@ -188,45 +188,29 @@ def _from_topic(
     tree = tree.towards(choice.body or child, named=False)
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
-    if optical and not choice.optical and tree.is_world_of(optical, parent, choice.body or child):
-        return _of_odometry(tree, optical, parent, choice.body or child or "the sensor", timed, notes, name)
-    fixed = choice.frame or parent
-    with naming(f"{reader.path}: topic {name}"):
-        body, body_note = body_of(tree, optical, choice.body or child, name, parent)
-    if choice.frame:
-        must_connect(reader, tree, fixed, parent)
-    notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{body_note}")
+    body = choice.body or child
+    registered = bool(optical) and not choice.optical and tree.is_world_of(optical, parent, body)
+    if registered:
+        fixed = optical
+        of = f", of {body or 'the sensor'}, from where the data were moved to {fixed}"
+    else:
+        fixed = choice.frame or parent
+        with naming(f"{reader.path}: topic {name}"):
+            body, of = body_of(tree, optical, body, name, parent)
+        if choice.frame:
+            must_connect(reader, tree, fixed, parent)
+    notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{of}")
 
     def at(stamp: float, largest_gap: float) -> Pose | None:
-        T_parent_body = timed.at(stamp, largest_gap)
-        T_fixed_parent = tree.lookup(fixed, parent, stamp, largest_gap)
-        T_body_optical = tree.lookup(body, optical, stamp, largest_gap)
-        if T_parent_body is None or T_fixed_parent is None or T_body_optical is None:
-            return None
-        return T_fixed_parent @ T_parent_body @ T_body_optical
+        steps = [tree.lookup(fixed, parent, stamp, largest_gap), timed.at(stamp, largest_gap)]
+        steps += [] if registered else [tree.lookup(body, optical, stamp, largest_gap)]
+        known = [step for step in steps if step is not None]
+        return None if len(known) < len(steps) else reduce(np.matmul, known)
 
-    assumed = body == optical and child != optical
-    return BagPoses(at, f"{name}: {_span(timed)}", notes, stamps=timed.stamps, assumed=assumed)
-
-
-def _of_odometry(
-    tree: TransformTree,
-    fixed: str,
-    parent: str,
-    body: str,
-    timed: TimedPoses,
-    notes: list[str],
-    name: str,
-) -> BagPoses:
-    """The poses of a body in ``parent`` as those in the ``fixed`` frame that the data were moved to."""
-    notes.append(f"poses in {fixed} from {name}, of {body}, from where the data were moved to {fixed}")
-
-    def at(stamp: float, largest_gap: float) -> Pose | None:
-        T_fixed_parent = tree.lookup(fixed, parent, stamp, largest_gap)
-        T_parent_body = timed.at(stamp, largest_gap)
-        return None if T_fixed_parent is None or T_parent_body is None else T_fixed_parent @ T_parent_body
-
-    return BagPoses(at, f"{name}: {_span(timed)}", notes, registered=True)
+    source = f"{name}: {_span(timed)}"
+    if registered:
+        return BagPoses(at, source, notes, registered=True)
+    return BagPoses(at, source, notes, stamps=timed.stamps, assumed=body == optical and child != optical)
 
 
 def _read_poses(

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.datasets.runs import choose_run, starts_of_runs
+from taichi_mrf.datasets.trajectories import starts_of_runs
+from taichi_mrf.errors import DatasetError
 
 NEAR_NS = 5_000_000_000
 """Other topics see the clock start again at most this much before or after the sensor's."""
@@ -50,6 +52,31 @@ def _bound(gap: Gap, starts: Sequence[int], places: Sequence[int]) -> int:
     if near:
         return min(near, key=lambda i: abs(places[i] - middle))
     return next((i for i, place in enumerate(places) if place >= gap[1]), len(places))
+
+
+def choose_run(
+    stamps: Sequence[float], wanted: int, where: str, what: str
+) -> tuple[int, list[int], list[str]]:
+    """The number, from 0, of the run that the user wants (from 1; 0 is the longest), the bounds of all runs,
+    and a note that names the others. ``where`` is the recording, ``what`` has stamps, such as images. Raises
+    DatasetError if there is no such run."""
+    bounds = [*starts_of_runs(stamps), len(stamps)]
+    parts = list(pairwise(bounds))
+    words = [
+        f"run {i + 1} ({stamps[first]:.3f} to {stamps[stop - 1]:.3f} s, {stop - first} {what})"
+        for i, (first, stop) in enumerate(parts)
+    ]
+    if not 0 <= wanted <= len(parts):
+        raise DatasetError(f"{where}: there is no run {wanted}; it has {', '.join(words)}")
+    number = wanted - 1 if wanted else max(range(len(parts)), key=lambda i: parts[i][1] - parts[i][0])
+    if len(parts) == 1:
+        return number, bounds, []
+    others = ", ".join(each for i, each in enumerate(words) if i != number)
+    return (
+        number,
+        bounds,
+        [f"the clock starts again: of {words[number]} and {others}, the first named is read (?run=N)"],
+    )
 
 
 def run_of(

@@ -1,21 +1,28 @@
-"""The messages of a bag's sensor that are mapped, and their poses."""
+"""The messages of a bag's sensor that are mapped, their poses, and the cameras that took them, out of a
+CameraInfo."""
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
-from taichi_mrf.datasets.options import ReadOptions
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
+from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
-from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
-from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
@@ -126,3 +133,208 @@ def posed_by(
     )
     notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes), *dropped]
     return [(i, entries[i], pose) for i, pose in posed], notes
+
+
+_LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
+
+_LOOKED_AT = 5
+"""So many images at most are decoded to learn their size."""
+
+
+@dataclass(frozen=True)
+class StatedCamera:
+    """A camera that a CameraInfo states: ``full``, and as its region of interest and binning ``cut`` it."""
+
+    full: PinholeCamera
+    cut: PinholeCamera
+
+    def of(self, shape: tuple[int, int]) -> PinholeCamera | None:
+        """The camera of images (height, width): cut as stated, else full, as of drivers that state the camera
+        of the cut images, else one of these scaled alike along both sides. None if none has that size."""
+        height, width = shape
+        for camera in (self.cut, self.full):
+            if camera.shape == shape:
+                return camera
+        for camera in (self.cut, self.full):
+            if camera.width * height == camera.height * width:
+                return camera.scaled(width / camera.width)
+        return None
+
+
+@dataclass(frozen=True)
+class BagCameras:
+    """The cameras by the frame of their images (empty for all), each with the time in seconds from which
+    on it took them; the ``first``; the ``distortion`` of all; ``notes`` for the user."""
+
+    by_frame: Mapping[str, Sequence[tuple[float, StatedCamera]]]
+    first: PinholeCamera
+    distortion: tuple[float, ...] = ()
+    notes: list[str] = field(default_factory=list)
+
+    def at(self, entry: Entry, shape: tuple[int, int] | None = None) -> PinholeCamera:
+        """The camera that took an image, of the size that was stated if none has the image's."""
+        stated = self.by_frame.get(entry.frame) or self.by_frame[""]
+        begin = [since for since, _ in stated]
+        camera = stated[max(0, bisect_right(begin, entry.stamp) - 1)][1]
+        return (camera.of(shape) if shape is not None else None) or camera.cut
+
+
+def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:
+    """The cameras of a topic's images, given by the user or by CameraInfo on the topic ``wanted`` or the only
+    one that fits. Raises DatasetError, which names file, topic and remedy, if they are not known or do not
+    fit the images."""
+    reader, entries, given = sensor.reader, sensor.entries, options.camera
+    if options.intrinsics is not None and given is None:
+        given = PinholeCamera(*_first_size(reader, depth), *options.intrinsics)
+    if given is not None:
+        return BagCameras({"": [(0.0, StatedCamera(given, given))]}, given)
+    if not (wanted or depth.info):
+        raise DatasetError(f"{reader.path}: contains no CameraInfo; pass --camera fx,fy,cx,cy")
+    name = choose(reader, "info", wanted, depth.info, f"topics of the CameraInfo of {depth.name}")
+    if reader.first(name) is None or reader.topics[name].type != messages.CAMERA_INFO:
+        raise DatasetError(f"{reader.path}: topic {name} contains no {messages.CAMERA_INFO}")
+    stated: dict[str, list[tuple[float, StatedCamera, tuple[float, ...]]]] = {}
+    problems: dict[str, str] = {}  # a driver that warms up may send zeros first
+    early = _half_a_frame(entries)
+    sent = dict(reader.messages(name))
+    for entry in sensor.run.of(list(sent)) or sent:
+        message = sent[entry]
+        try:
+            camera, distortion = camera_of(message, depth.rectified)
+        except DatasetError as error:
+            problems.setdefault(entry.frame, str(error))
+            continue
+        found = stated.setdefault(entry.frame, [])
+        if not found or found[-1][1:] != (camera, distortion):
+            found.append((entry.stamp - early, camera, distortion))
+    frames = dict.fromkeys(entry.frame for entry in entries)
+    by_frame, lenses = {}, []
+    for frame in frames:
+        of = _frame_of_info(reader, depth, name, frame, [*stated, *problems], bool(wanted), len(frames) > 1)
+        if of not in stated:
+            raise DatasetError(f"{reader.path}: topic {name}: {problems[of]}")
+        found = stated[of]
+        if len(found) > 1 and any(distortion for _, _, distortion in found):
+            raise DatasetError(
+                f"{reader.path}: topic {name}: the camera changes at {found[1][0] + early:.3f} s and its "
+                "lens is distorted; --camera fx,fy,cx,cy takes one for all images, with --undistort"
+            )
+        by_frame[frame] = [(since, camera) for since, camera, _ in found]
+        lenses.append(found[0][2])
+    if len(set(lenses)) > 1:
+        raise DatasetError(
+            f"{reader.path}: topic {name}: the cameras of {', '.join(frames)} have different lenses; "
+            "?optical=FRAME takes one's images only"
+        )
+    cameras = BagCameras(by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame))
+    return _fitted(reader, depth, name, entries, cameras)
+
+
+def _frame_of_info(
+    reader: RosReader, depth: DepthTopic, name: str, frame: str, known: list[str], wanted: bool, several: bool
+) -> str:
+    """The frame of the CameraInfo of images in a frame. Raises DatasetError if there is none."""
+    if frame in known:
+        return frame
+    if not several and (wanted or not frame or "" in known):
+        return "" if "" in known else known[0]
+    raise DatasetError(
+        f"{reader.path}: the images of {depth.name} are of the frame {frame}, but the CameraInfo "
+        f"of {name} is of {', '.join(dict.fromkeys(known))}, maybe another camera's; "
+        "pass --camera fx,fy,cx,cy" + ("" if several else f", or ?info={name} to take it all the same")
+    )
+
+
+def _changes(by_frame: Mapping[str, Sequence[object]]) -> list[str]:
+    count = max((len(cameras) for cameras in by_frame.values()), default=1)
+    times = "once" if count == 2 else f"{count - 1} times"
+    return [f"the camera changes {times}, by its CameraInfo"] if count > 1 else []
+
+
+def _half_a_frame(entries: Sequence[Entry]) -> float:
+    """Half the usual time between images in seconds: a CameraInfo may be that much later than its image."""
+    gaps = np.diff(np.unique([entry.stamp for entry in entries]))
+    return 0.5 * float(np.median(gaps)) if len(gaps) else 0.0
+
+
+def _fitted(
+    reader: RosReader, depth: DepthTopic, name: str, entries: Sequence[Entry], cameras: BagCameras
+) -> BagCameras:
+    """The cameras with the first one as it fits its images, and a note if they are of another size than its
+    CameraInfo. Raises DatasetError if none of the first images fits."""
+    problem = ""
+    for entry in entries[:_LOOKED_AT]:
+        try:
+            height, width = shape = messages.depth_image(reader.read(depth.name, entry), None).shape
+        except DatasetError:
+            continue
+        stated, camera = cameras.at(entry), cameras.at(entry, shape)
+        sizes = f"{width} x {height} pixels, the CameraInfo of {name} {stated.width} x {stated.height}"
+        if camera.shape == shape:
+            scaled = f"the images of {depth.name} have {sizes}: the camera is fitted to them"
+            notes = [scaled] if stated.shape != shape else []
+            return replace(cameras, first=camera, notes=cameras.notes + notes)
+        problem = problem or sizes
+    if problem:
+        raise DatasetError(
+            f"{reader.path}: the images of {depth.name} have {problem}, which is not the same view; "
+            "pass --camera fx,fy,cx,cy"
+        )
+    return cameras
+
+
+def _first_size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
+    """(width, height) of a topic's first image."""
+    with naming(f"{reader.path}: topic {depth.name}"):
+        height, width = messages.depth_image(reader.first(depth.name), None).shape
+    return width, height
+
+
+def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ...]]:
+    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
+
+    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
+    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
+    OpenCV's.
+    """
+    K, D, P = (_field(info, name) for name in "kdp")
+    matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
+    if matrix[0, 0] == 0:
+        raise DatasetError("is not calibrated (K is zero); pass --camera fx,fy,cx,cy")
+    try:
+        full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
+        camera = StatedCamera(full, _cut(full, info))
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
+    if rectified or not D.any():
+        return camera, ()
+    if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:
+        raise DatasetError(
+            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not supported; "
+            "--undistort 0,0,0,0 uses the images as they are"
+        )
+    return camera, tuple(float(k) for k in D)
+
+
+def _cut(camera: PinholeCamera, info: Any) -> PinholeCamera:
+    """The camera of the pixels that are left by the region of interest, in pixels of the full image, and then
+    by binning; 0 stands for the whole and for none (sensor_msgs/CameraInfo)."""
+    roi, bins = info.roi, (max(1, int(info.binning_x)), max(1, int(info.binning_y)))
+    width, height = int(roi.width) or camera.width, int(roi.height) or camera.height
+    x, y = (int(roi.x_offset), int(roi.y_offset)) if roi.width and roi.height else (0, 0)
+    if (width, height, x, y, *bins) == (camera.width, camera.height, 0, 0, 1, 1):
+        return camera
+    return PinholeCamera(
+        width // bins[0],
+        height // bins[1],
+        camera.fx / bins[0],
+        camera.fy / bins[1],
+        (camera.cx - x) / bins[0],
+        (camera.cy - y) / bins[1],
+    )
+
+
+def _field(message: Any, name: str) -> NDArray[np.float64]:
+    """An array of a CameraInfo, whose names ROS 1 writes in capitals."""
+    values = getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
+    return np.asarray(values, np.float64)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.errors import DatasetError
 
@@ -36,9 +35,12 @@ class DepthTopic:
 
 def image_topics(reader: RosReader) -> list[DepthTopic]:
     """The topics of images as their first messages show them."""
-    images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
-    names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    return [described(reader, name) for name in names]
+    return [described(reader, name) for name in topics_of(reader, *messages.IMAGES)]
+
+
+def topics_of(reader: RosReader, *types: str) -> list[str]:
+    """The topics with messages of some types."""
+    return [topic.name for topic in reader.topics.values() if topic.type in types and topic.messages]
 
 
 def depth_topics(reader: RosReader) -> list[DepthTopic]:
@@ -69,7 +71,7 @@ def no_depth(reader: RosReader) -> str:
 
 def cloud_topics(reader: RosReader) -> list[str]:
     """The topics of point clouds."""
-    return [topic.name for topic in reader.topics.values() if topic.type == POINT_CLOUD and topic.messages]
+    return topics_of(reader, messages.POINT_CLOUD)
 
 
 def message_frame(reader: RosReader, topic: str) -> str:
@@ -82,7 +84,7 @@ def described(reader: RosReader, name: str) -> DepthTopic:
     """A topic of images as its first message shows it. Raises DatasetError, which names file and topic, if it
     has other messages or none."""
     topic = reader.topics[name]
-    if topic.type not in (messages.IMAGE, messages.COMPRESSED_IMAGE):
+    if topic.type not in messages.IMAGES:
         raise DatasetError(f"{reader.path}: topic {name} is of type {topic.type}, not {messages.IMAGE}")
     message = reader.first(name)
     if message is None:
@@ -95,7 +97,7 @@ def _camera_topics(reader: RosReader, depth: str, frame: str) -> tuple[str, ...]
     """The CameraInfo topics of a depth topic: of those in its images' ``frame``, or of all if none is, those
     that share the longest beginning of their names with it. One is left in most bags, since drivers put
     camera_info beside the image."""
-    every = [t.name for t in reader.topics.values() if t.type == messages.CAMERA_INFO and t.messages]
+    every = topics_of(reader, messages.CAMERA_INFO)
     names = [name for name in every if frame and message_frame(reader, name) == frame] or every
     shared = {name: _shared_parts(name, depth) for name in names}
     most = max(shared.values(), default=0)
@@ -105,16 +107,6 @@ def _camera_topics(reader: RosReader, depth: str, frame: str) -> tuple[str, ...]
 def _shared_parts(a: str, b: str) -> int:
     pairs = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
     return next((i for i, (x, y) in enumerate(pairs) if x != y), min(a.count("/"), b.count("/")))
-
-
-def pose_topics(reader: RosReader) -> list[str]:
-    """The topics whose messages are poses of one body."""
-    return [t.name for t in reader.topics.values() if t.type in messages.POSES and t.messages]
-
-
-def path_topics(reader: RosReader) -> list[str]:
-    """The topics whose messages are all poses of a body so far."""
-    return [t.name for t in reader.topics.values() if t.type == messages.PATH and t.messages]
 
 
 def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:

@@ -26,9 +26,16 @@ from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
-from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
-from taichi_mrf.datasets.timed_poses import largest_gap, read_timed_poses, within_gap
+from taichi_mrf.datasets.stereo.matching import (
+    RecordedPair,
+    StereoMatching,
+    StereoPairs,
+    StereoRig,
+    noise_note,
+    read_times,
+    size_of_pairs,
+)
+from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import as_pose
@@ -128,7 +135,7 @@ def _rig(path: Path, described: RigFile, left: Sequence[Path], options: ReadOpti
             return StereoRig(options.camera, described.baseline)
         fy = described.fx if described.fy is None else described.fy
         own = (described.fx, fy, described.cx, described.cy)
-        camera = PinholeCamera(*first_size(path, left), *(options.intrinsics or own))
+        camera = PinholeCamera(*size_of_pairs(path, left), *(options.intrinsics or own))
         return StereoRig(camera, described.baseline)
 
 
@@ -164,9 +171,8 @@ def _pairs(
     if trajectory.layout == "stamped":
         if stamps is None:
             raise DatasetError(f"{poses_file}: has stamps, but the images have none; add times: FILE")
-        timed, gap = read_timed_poses(poses_file), largest_gap(options)
-        where, at = str(poses_file), [timed.at(stamp, gap) for stamp in stamps]
-        posed, notes = within_gap(stamps, at, gap, "stereo pairs", where, poses_file.name, timed.stamps)
+        timed, where = read_timed_poses(poses_file), str(poses_file)
+        posed, notes = timed.posed(stamps, options, "stereo pairs", where, poses_file.name)
         pairs = [RecordedPair(images[i][0].stem, stamps[i], as_pose(T), where, *images[i]) for i, T in posed]
         return pairs, notes, len(images) - len(pairs)
     if len(trajectory.poses) != len(images):

@@ -6,7 +6,7 @@ Everything here is NumPy; ``analytic_render`` takes pictures of it. World frame 
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -107,5 +107,5 @@ def translated(solids: Iterable[Solid], offset: Point) -> tuple[Solid, ...]:
     moved = []
     for s in solids:
         center = (s.center[0] + offset[0], s.center[1] + offset[1], s.center[2] + offset[2])
-        moved.append(Solid(s.kind, center, s.half_size, s.yaw, s.color, s.checker))
+        moved.append(replace(s, center=center))
     return tuple(moved)

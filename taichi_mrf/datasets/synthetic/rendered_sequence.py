@@ -9,16 +9,16 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets.base import Dataset, StatedSensor
-from taichi_mrf.datasets.options import PRIMESENSE
+from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions, parse_options, require
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
-from taichi_mrf.errors import BackendError, ConfigError
+from taichi_mrf.errors import BackendError, DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -101,13 +101,7 @@ class RenderOptions:
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
 
     def __post_init__(self) -> None:
-        self.require(frames=1, width=8, height=8, seed=0)
-
-    def require(self, **least: int) -> None:
-        """Raise ConfigError for the first of these fields that is less than its least value."""
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise ConfigError(f"{name} must be at least {value}, not {getattr(self, name)}")
+        require(self, frames=1, width=8, height=8, seed=0)
 
     def camera(self) -> PinholeCamera:
         """The Kinect 1's field of view on this many pixels, which are square."""
@@ -200,3 +194,18 @@ class RenderedSequence(Dataset):
         if picture is not None and self.options.texture == "mottled":
             picture = mottled(picture, depth_m, self.camera, T_world_camera)
         return depth_m, picture
+
+
+AnySequence = TypeVar("AnySequence", bound=RenderedSequence)
+
+
+def open_scene(kind: type[AnySequence], name: str, query: str, options: ReadOptions) -> AnySequence:
+    """Open a built-in scene with the options after the question mark of its name.
+
+    Raises DatasetError for an option that does not exist (naming the nearest), a value of the wrong type or
+    out of range, and for a depth scale, which rendered depth does not have.
+    """
+    if options.depth_scale is not None:
+        raise DatasetError(f"{name}: takes no depth_scale: its depth is in metres")
+    chosen = parse_options(type(kind.options), query, name)
+    return kind(name, options.camera or chosen.camera(), options=chosen, color=options.color)

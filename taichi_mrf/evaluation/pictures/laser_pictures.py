@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.laser.plan_image import FloorPlan
+from taichi_mrf.datasets.laser.scans import FloorPlan
 from taichi_mrf.evaluation.floor_plan import LaserMap
 from taichi_mrf.evaluation.pictures.figures import new_figure
 

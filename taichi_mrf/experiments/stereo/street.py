@@ -14,7 +14,7 @@ import numpy as np
 
 from taichi_mrf import PinholeCamera, PolynomialNoise, VisibilityMap, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.datasets.stereo.pairs import StereoPairs
+from taichi_mrf.datasets.stereo.matching import StereoPairs
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.experiments.contenders import VISIBILITY_TABLE_I, Contender, log_odds, mrf
 from taichi_mrf.experiments.scenes import Scene, SceneView

@@ -1,4 +1,7 @@
-"""Rectified stereo pairs in KITTI's odometry layout (A. Geiger, P. Lenz and R. Urtasun, CVPR 2012).
+"""KITTI's odometry layout (A. Geiger, P. Lenz and R. Urtasun, CVPR 2012): rectified stereo pairs, or the
+scans of a velodyne.
+
+Stereo pairs:
 
 - ``image_l`` and ``image_r`` (or ``image_0`` and ``image_1``): a pair has one numbered name in both
 - ``calib.txt``: the 3 x 4 projections P0 and P1 of the left and right camera, row by row, 12 numbers each: in
@@ -6,22 +9,133 @@
 - ``poses.txt``: for each pair the 3 x 4 matrix from the left camera to the first left camera, so the world
   has that camera's axes: y down, z forward
 - ``times.txt``: for each pair its stamp in seconds; without it the pairs are KITTI's 0.1 s apart
+
+Scans; their folder ``velodyne`` may be named in place of the sequence's:
+
+- ``velodyne/NNNNNN.bin``: x y z and reflectance of each point, float32, in the lidar's frame (z up)
+- ``calib.txt``: the 3 x 4 matrix ``Tr``, which takes the lidar's points to the left camera
+- ``poses.txt``, or ``../../poses/NN.txt``: for each scan the 3 x 4 pose of the left camera
+- ``times.txt``: for each scan its stamp in seconds; without it scans are 0.1 s apart
+
+The world of scans is the frame of the lidar at the first pose, as SemanticKITTI has it: T_world_lidar is
+Tr^-1 P Tr.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.derived import pose_of
+from taichi_mrf.datasets.entries import velodyne_sequence
+from taichi_mrf.datasets.lidar.clouds import natural, number_of, read_cloud
+from taichi_mrf.datasets.lidar.registered import in_world, read_of_sensor
+from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.stereo.matching import StereoRig
-from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
-from taichi_mrf.datasets.trajectories import read_trajectory
-from taichi_mrf.errors import ConfigError, DatasetError, naming
+from taichi_mrf.datasets.stereo.matching import (
+    RecordedPair,
+    StereoPairs,
+    StereoRig,
+    noise_note,
+    read_times,
+    size_of_pairs,
+)
+from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, read_trajectory
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
+from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import read_text
+from taichi_mrf.system.files import is_file, is_folder, read_text
+
+SCANS = "velodyne"
+_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+
+
+def open_scans(path: Path, options: ReadOptions) -> Dataset:
+    """List the scans in the order of their numbers. Raises DatasetError, which names the file and line."""
+    folder = velodyne_sequence(path)
+    assert folder is not None
+    files = _scans(folder)
+    T_camera_lidar = read_calibration(folder / CALIBRATION)
+    poses = _poses_of_scans(folder)
+    notes, stamps = [], None
+    if is_file(folder / TIMES):
+        stamps = read_times(folder / TIMES)
+    else:
+        notes.append(f"no {TIMES} in {folder}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next")
+    by_number = {int(pose.key): pose for pose in poses.poses}
+    found: list[tuple[Path, float, RecordedPose]] = []
+    for file in files:
+        number = number_of(file)
+        if number not in by_number or (stamps is not None and number >= len(stamps)):
+            continue
+        stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
+        found.append((file, stamp, by_number[number]))
+    undo = options.conventions
+    with naming(str(folder)):
+        world = in_world(
+            len(found),
+            lambda i: pose_of(_pose(found[i][2], T_camera_lidar), undo),
+            lambda i: read_cloud(found[i][0]),
+        )
+    if world:
+        notes.append(
+            "points are in the world's frame: clouds fit together as they are; rays begin at the poses"
+        )
+    scans = [
+        RecordedScan(
+            file.stem, stamp, partial(_pose, pose, T_camera_lidar), pose.source,
+            partial(read_of_sensor, partial(read_cloud, file), world, undo), str(file),
+        )
+        for file, stamp, pose in found
+    ]  # fmt: skip
+    dropped = len(files) - len(scans)
+    if not scans:
+        raise DatasetError(f"{poses.path}: has a pose for none of the {len(files)} scans in {folder / SCANS}")
+    if dropped:
+        notes.append(
+            f"{dropped} of {len(files)} scans dropped: {poses.path.name} or {TIMES} ends before them"
+        )
+    return lidar_scans(folder.name, scans, notes, dropped, options)
+
+
+def read_calibration(path: Path) -> Pose:
+    """T_camera_lidar, (4, 4), of the line ``Tr:``. Raises DatasetError, which names the file."""
+    words = next((words for name, words in _labelled(path).items() if name in _TO_CAMERA), None)
+    if words is None:
+        raise DatasetError(f"{path}: has no line Tr:, the 3 x 4 matrix from the lidar to the camera")
+    try:
+        return as_pose(np.array([float(word) for word in words]).reshape(3, 4))
+    except ValueError:
+        raise DatasetError(f"{path}: Tr must be 12 numbers") from None
+    except KeyframeError as error:
+        raise DatasetError(f"{path}: Tr: {error}") from error
+
+
+def _scans(folder: Path) -> list[Path]:
+    files = (folder / SCANS).iterdir() if is_folder(folder / SCANS) else ()
+    return sorted((file for file in files if file.suffix == ".bin" and is_file(file)), key=natural)
+
+
+def _poses_of_scans(folder: Path) -> Trajectory:
+    places = (folder / POSES, folder.parent.parent / "poses" / f"{folder.name}.txt")
+    path = next((place for place in places if is_file(place)), None)
+    if path is None:
+        raise DatasetError(
+            f"{folder}: no poses of its scans; looked for {POSES} and ../../poses/{folder.name}.txt"
+        )
+    trajectory = read_trajectory(path)
+    if trajectory.layout == "stamped":
+        raise DatasetError(f"{path}: expected a 3 x 4 matrix, row by row, in each line, or behind its number")
+    return trajectory
+
+
+def _pose(pose: RecordedPose, T_camera_lidar: Pose) -> Pose:
+    """T_world_lidar."""
+    return inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
+
 
 FOLDERS = (("image_l", "image_r"), ("image_0", "image_1"))
 CALIBRATION, POSES, TIMES = "calib.txt", "poses.txt", "times.txt"
@@ -32,7 +146,7 @@ _SAME = 1e-6
 """Largest difference, relative to the focal length, of matrix entries that count as equal."""
 
 
-def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+def open_pairs(folder: Path, options: ReadOptions) -> Dataset:
     """List the pairs in the order of their names. One that lacks an image is listed, and named in an error
     when it is read."""
     if options.depth_scale is not None:
@@ -86,7 +200,7 @@ def _read_rig(folder: Path, left: str, names: Sequence[str], options: ReadOption
     if options.camera is not None:
         recorded = read_rig(calibration, options.camera.width, options.camera.height)
         return StereoRig(options.camera, recorded.baseline_m)
-    recorded = read_rig(calibration, *first_size(folder / left, (folder / left / name for name in names)))
+    recorded = read_rig(calibration, *size_of_pairs(folder / left, (folder / left / name for name in names)))
     if options.intrinsics is None:
         return recorded
     camera = PinholeCamera(recorded.camera.width, recorded.camera.height, *options.intrinsics)
@@ -123,17 +237,21 @@ def read_rig(path: Path, width: int, height: int) -> StereoRig:
         return StereoRig(camera, baseline_m=-float(P_right[0, 3] / fx))
 
 
+def _labelled(path: Path) -> dict[str, list[str]]:
+    """The words of a calibration's lines by what stands before their colons."""
+    lines = [line.partition(":") for line in read_text(path, DatasetError).splitlines()]
+    return {name.strip(): rest.split() for name, colon, rest in lines if colon}
+
+
 def _read_projections(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """P0 and P1, (3, 4) each."""
-    text = read_text(path, DatasetError)
-    lines = [words for line in text.splitlines() if (words := line.split())]
-    labelled = {words[0]: words[1:] for words in lines if words[0].endswith(":")}
-    rows = labelled or {f"P{i}:": words for i, words in enumerate(lines)}
+    lines = [words for line in read_text(path, DatasetError).splitlines() if (words := line.split())]
+    rows = _labelled(path) or {f"P{i}": words for i, words in enumerate(lines)}
     return _projection(path, "P0", rows), _projection(path, "P1", rows)
 
 
 def _projection(path: Path, name: str, rows: dict[str, list[str]]) -> NDArray[np.float64]:
-    words = rows.get(f"{name}:")
+    words = rows.get(name)
     if words is None:
         raise DatasetError(f"{path}: {name} is missing")
     try:

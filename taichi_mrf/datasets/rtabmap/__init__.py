@@ -1,1 +1,0 @@
-"""Databases of RTAB-Map: recordings, and poses that change while it runs."""
