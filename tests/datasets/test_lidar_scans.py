@@ -256,9 +256,7 @@ def test_as_many_stamped_poses_as_scans_or_names_that_are_times(tmp_path: Path) 
     refused(folder, "contains several files of poses, poses.txt, poses2.txt")
 
 
-@pytest.mark.parametrize(
-    "option", [{"depth_scale": 1000.0}, {"intrinsics": (9.0, 9.0, 4.0, 4.0)}, {"image_scale": 0.5}]
-)
+@pytest.mark.parametrize("option", [{"intrinsics": (9.0, 9.0, 4.0, 4.0)}, {"image_scale": 0.5}])
 def test_options_of_images_are_refused(tmp_path: Path, option: dict[str, object]) -> None:
     refused(npz_scans(tmp_path / "walk"), "contains lidar scans", **option)
 
@@ -328,6 +326,22 @@ def test_what_is_known_of_a_lidar_takes_the_place_of_the_defaults(tmp_path: Path
     assert with_recorded_noise(chosen, dataset) == chosen
     assert [reach_of(np.array([0.0, x])) for x in (3.0, 10.0, 44.2, 1e30)] == [10.0, 10.0, 50.0, 500.0]
     assert reach_of(np.append(np.full(5000, 22.0), 1e9)) == 30.0, "a damaged point says nothing"
+
+
+def test_points_in_millimetres_are_refused_with_the_flag_that_takes_them(tmp_path: Path) -> None:
+    metres, millimetres = tmp_path / "m", tmp_path / "mm"
+    for folder, unit in ((metres, 1.0), (millimetres, 1000.0)):
+        folder.mkdir()
+        for i, cloud in enumerate(WALK.clouds):
+            write_ply(folder / f"{i}.ply", unit * cloud)
+        rows_of_poses(folder / "poses.txt")
+    refused(millimetres, r"which are hardly metres: --depth-scale 1000 takes them for millimetres")
+    expected, found = open_dataset(metres), open_dataset(millimetres, depth_scale=1000.0)
+    for i in range(len(expected)):
+        np.testing.assert_allclose(found.read(i).depth_m, expected.read(i).depth_m, rtol=1e-6)
+    far = open_dataset(millimetres, depth_scale=1.0)
+    assert far.read(0).depth_m.max() > 1000
+    assert far.notes[-1].endswith("set sensor.max_depth")
 
 
 @pytest.mark.shared_data

@@ -146,7 +146,7 @@ def test_submaps_choose_keyframes_for_each_sensor_too(robot: Path) -> None:
         ("sensors: [{source: scans, min_depth: 4, max_depth: 3}]", "max_depth must be more than min_depth"),
         ("sensors: [{source: scans, T_poses_sensor: [1, 2]}]", "T_poses_sensor must have 12 or 16 numbers"),
         ("sensors: [{source: nowhere}]", "sensor-1: .*nowhere: no such folder or file"),
-        ("sensors: [{source: scans, reading: {depth_scale: 9}}]", "sensor-1: .*--depth-scale"),
+        ("sensors: [{source: scans, reading: {image_scale: 0.5}}]", "sensor-1: .*--image-scale"),
         ("sensors: [{source: scans, name: a}, {source: scans, name: a}]", "two sensors have one name"),
         ("sensors: [{source: scans, T_poses_sensor: [2,0,0,0, 0,2,0,0, 0,0,2,0]}]", "sensor-1: the rotation"),
     ],

@@ -15,10 +15,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.hints import unread_poses
@@ -232,7 +232,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     world = chosen.points == WORLD
     if not chosen.points:
         with naming(str(path)):
-            world, frame = _frame_of(posed, found, poses is None, options.conventions)
+            world, frame = _frame_of(posed, found, poses is None, options)
         notes += frame
     scans = [
         RecordedScan(
@@ -240,7 +240,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
             pose.stamp,
             pose.read,
             pose.source,
-            partial(read_of_sensor, partial(read_cloud, cloud), world, options.conventions),
+            partial(read_of_sensor, partial(_read_metres, cloud, options), world, options.conventions),
             str(cloud),
         )
         for cloud in posed
@@ -252,7 +252,14 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     dropped = len(clouds) - len(scans)
     if dropped and poses is not None:
         notes.append(f"{dropped} of {len(clouds)} scans dropped: {poses.name} has no pose for them")
-    return lidar_scans(path.name if is_folder(path) else path.stem, scans, notes, dropped, options)
+    name = path.name if is_folder(path) else path.stem
+    return lidar_scans(name, scans, notes, dropped, options, takes_scale=True)
+
+
+def _read_metres(cloud: Path, options: ReadOptions) -> NDArray[np.float64]:
+    """The points of a cloud, in the unit of ``options.depth_scale``. Raises DatasetError."""
+    points = read_cloud(cloud)
+    return points if options.depth_scale is None else points / options.depth_scale
 
 
 def clouds_of(folder: Path) -> list[Path]:
@@ -317,13 +324,15 @@ def _viewpoint(cloud: Path) -> Pose:
 
 
 def _frame_of(
-    clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool, conventions: Conventions
+    clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool, options: ReadOptions
 ) -> tuple[bool, list[str]]:
     """True if points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
     better, and a note where it is not as documented. Raises DatasetError for poses in other
-    ``conventions``."""
+    conventions."""
     found = in_world(
-        len(clouds), lambda i: pose_of(poses[clouds[i]].read(), conventions), lambda i: read_cloud(clouds[i])
+        len(clouds),
+        lambda i: pose_of(poses[clouds[i]].read(), options.conventions),
+        lambda i: _read_metres(clouds[i], options),
     )
     if found is None or found == viewpoints:
         told = ["VIEWPOINT is taken for the sensor's pose, and points for those of the world's frame"]

@@ -160,13 +160,15 @@ _REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
 
 @dataclass
 class LidarRecording(Dataset):
-    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read."""
+    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read.
+    ``unit_is_known``: the points are metres, because their format or the user says so."""
 
     reach_m: float | None = field(default=None, kw_only=True)
+    unit_is_known: bool = field(default=True, kw_only=True)
 
     def look_at_first(self, what: str) -> None:
         """Set camera and reach from the first scan (``what``) that can be read. Raises DatasetError, which
-        says why the first cannot, if none can."""
+        says why the first cannot, if none can, and if its points are hardly metres."""
         problem: FrameError | None = None
         for index in range(len(self)):
             try:
@@ -174,6 +176,13 @@ class LidarRecording(Dataset):
             except FrameError as error:
                 problem = problem or error
                 continue
+            far_m = median_range(frame.depth_m)
+            if far_m > MOST_REACH_M and not self.unit_is_known:
+                raise DatasetError(
+                    f"{self.name}: half of the points of {frame.name} are further away than {far_m:.0f} m, "
+                    "which are hardly metres: --depth-scale 1000 takes them for millimetres, --depth-scale 1 "
+                    "for metres all the same"
+                )
             self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
             return
         raise DatasetError(f"{self.name}: no {what} can be read: {problem}") from problem
@@ -189,14 +198,18 @@ class LidarRecording(Dataset):
         )
 
 
+def median_range(range_m: NDArray[np.floating]) -> float:
+    """The median of ranges, 0 for none."""
+    return float(np.median(range_m[range_m > 0]))
+
+
 def reach_of(range_m: NDArray[np.floating]) -> float:
     """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
     of metres, and at most MOST_REACH_M. Warns if most go further."""
-    median_m = float(np.median(range_m[range_m > 0]))
-    if median_m > MOST_REACH_M:
+    far_m = median_range(range_m)
+    if far_m > MOST_REACH_M:
         warnings.warn(
-            f"half of the points of the first scan are further than {median_m:.0f} m: points are read as "
-            "metres, so divide them by 1000 if they are millimetres; else set sensor.max_depth",
+            f"half of the points of the first scan are further than {far_m:.0f} m: set sensor.max_depth",
             stacklevel=3,
         )
     reach_m = np.quantile(range_m[range_m > 0], 0.999)
@@ -249,21 +262,30 @@ def measured_points(points_m: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def lidar_scans(
-    name: str, scans: Sequence[RecordedScan], notes: Sequence[str], dropped: int, options: ReadOptions
+    name: str,
+    scans: Sequence[RecordedScan],
+    notes: Sequence[str],
+    dropped: int,
+    options: ReadOptions,
+    takes_scale: bool = False,
 ) -> LidarScans:
-    """The recording of these scans. Raises DatasetError if none can be read, which is the first one's error,
-    and for options that only depth images have."""
-    refuse_image_options(name, options)
-    found = LidarScans(name, RayTable([[1.0, 0.0, 0.0]]), list(notes), dropped, rows=scans)
+    """The recording of these scans. ``takes_scale``: their files do not tell the unit of points, and their
+    readers take that of ``options.depth_scale``. Raises DatasetError if none can be read, which is the first
+    one's error, and for options that only depth images have."""
+    refuse_image_options(name, options, takes_scale)
+    found = LidarScans(
+        name, RayTable([[1.0, 0.0, 0.0]]), list(notes), dropped, rows=scans,
+        unit_is_known=not takes_scale or options.depth_scale is not None,
+    )  # fmt: skip
     found.look_at_first("scan")
     return found
 
 
-def refuse_image_options(name: str, options: ReadOptions) -> None:
+def refuse_image_options(name: str, options: ReadOptions, takes_scale: bool = False) -> None:
     """Raise DatasetError, in one sentence, for options that only depth images have."""
     asked = {
         "--camera": options.camera is not None or options.intrinsics is not None,
-        "--depth-scale": options.depth_scale is not None,
+        "--depth-scale": options.depth_scale is not None and not takes_scale,
         "--undistort": options.undistort is not None,
         "--image-scale": options.image_scale != 1.0,
     }
