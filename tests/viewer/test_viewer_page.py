@@ -289,7 +289,7 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
         def as_html(self, dark: bool) -> str:
             made.append(dark)
             held.wait()
-            return "<head><script>window.__VISER_EMBED_DATA__=0;</script></head>"
+            return '<head><script>e.type="module"</script></head>'
 
     monkeypatch.setattr(handled.server, "get_scene_serializer", Scene)
     for _ in range(20):

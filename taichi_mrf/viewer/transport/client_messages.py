@@ -23,7 +23,7 @@ from viser._messages import (
     ViewerCameraMessage,
 )
 
-_FIELDS = {
+_FIELDS: dict[type[Message], tuple[str, ...]] = {
     kind: tuple(field.name for field in fields(kind) if field.name != "excluded_self_client")
     for kind in (
         CommandTriggerMessage,
