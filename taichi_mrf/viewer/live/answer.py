@@ -1,61 +1,44 @@
 """The answer to a click on a voxel, in a panel beside it; and the distance from the click before."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Hello, KeyframeInfo
-from taichi_mrf.viewer.scene.base_panel import rows_html
+from taichi_mrf.viewer.scene.base_panel import BasePanel, rows_html
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
-from taichi_mrf.viewer.transport.process import Event, Inbox
 
 Point = tuple[float, float, float]
 Vote = tuple[KeyframeInfo, float]
 """A keyframe, and the log-odds that it adds to a voxel."""
 
-_MOST_VOTES = 5
+SWITCHES = tuple(f"switch off {place}" for place in range(5))
+"""Actions of the buttons beside what keyframes say of a voxel, by their places in the list."""
+
 _ASIDE_PX, _WIDTH_PX, _HEIGHT_PX = 65, 290, 430
 """Size of the panel with all buttons, and its distance from the voxel."""
 
 _LINE_COLOR = (255, 255, 255)
 
 
-@dataclass(frozen=True)
-class SwitchOff(Event):
-    """The button beside what a keyframe says of a voxel was pressed, by its place in the list."""
-
-    number: int
-
-
-@dataclass(frozen=True)
-class Closed(Event):
-    """The answer was closed."""
-
-
 class VoxelAnswer:
     """Owns a floating panel, and the scene nodes /answer, a label at the voxel, and /distance."""
 
-    def __init__(self, scene: viser.SceneApi, gui: viser.GuiApi, inbox: Inbox) -> None:
-        self._scene, self._gui, self._inbox = scene, gui, inbox
+    def __init__(self, scene: viser.SceneApi, panel: BasePanel) -> None:
+        self._scene = scene
         self.point: Point | None = None
         """The voxel that is shown, in metres, world; None without one."""
         self._apart: dict[str, str] = {}
-        self._panel = gui.add_panel(visible=False)
-        self._tab = self._panel.add_tab("Voxel", viser.Icon.CUBE)
-        with self._tab:
-            self._text = gui.add_html("")
-            self._switches = [self._add_switch(i) for i in range(_MOST_VOTES)]
-            gui.add_button("Close", color="gray").on_click(lambda event: inbox.put(Closed()))
+        self._panel = panel.gui.add_panel(visible=False)
+        with self._panel.add_tab("Voxel", viser.Icon.CUBE):
+            self._text = panel.gui.add_html("")
+            hint = "Remove this keyframe from the map."
+            self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
+            panel.add_button("Close", color="gray")
         self.said_by: list[int] = []
         """The keyframes that are listed."""
-
-    def _add_switch(self, number: int) -> viser.GuiButtonHandle:
-        button = self._gui.add_button("", visible=False, hint="Remove this keyframe from the map.")
-        button.on_click(lambda event: self._inbox.put(SwitchOff(number)))
-        return button
 
     def move(self, point: Point, place: tuple[float, float]) -> None:
         """Go to a voxel, show the panel at a ``place`` in the window (pixels), and draw a line from the voxel
@@ -85,7 +68,7 @@ class VoxelAnswer:
         self._text.content = (
             f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
         )
-        self.said_by = [keyframe.id for keyframe, _ in votes[:_MOST_VOTES]]
+        self.said_by = [keyframe.id for keyframe, _ in votes[: len(SWITCHES)]]
         for i, button in enumerate(self._switches):
             button.visible = i < len(self.said_by)
             if button.visible:

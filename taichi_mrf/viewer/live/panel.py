@@ -3,8 +3,6 @@ they do.
 """
 
 from dataclasses import dataclass
-from enum import Enum, auto
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -23,42 +21,7 @@ from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html, in_markdown
-from taichi_mrf.viewer.transport.process import Event
-
-
-class Action(Enum):
-    """A button, or a widget whose value asks the mapping process for something."""
-
-    PLAY = auto()
-    PAUSE = auto()
-    STEP = auto()
-    SPEED = auto()
-    TOP = auto()
-    FRONT = auto()
-    SIDE = auto()
-    FIT = auto()
-    FOLLOW = auto()
-    RESET = auto()
-    RESET_CONFIRMED = auto()
-    CHOOSE_KEYFRAME = auto()
-    SWITCH = auto()
-    FREEZE = auto()
-    FREEZE_CONFIRMED = auto()
-    CANCELLED = auto()
-    UNDO = auto()
-    REDO = auto()
-    TOGGLE_GIZMO = auto()
-    PUT_BACK = auto()
-    SET_POSITION = auto()
-    SHOW_PIXEL_RAY = auto()
-    WATCH_IMAGES = auto()
-    SHOW_TIME = auto()
-    SAVE_MAP = auto()
-    SAVE_VOXELS = auto()
-    SAVE_MESH = auto()
-    SAVE_PICTURE = auto()
-    SAVE_PAGE = auto()
-    RECORD = auto()
+from taichi_mrf.viewer.transport.inbox import Event
 
 
 @dataclass(frozen=True)
@@ -78,45 +41,26 @@ class Dragged(Event):
     holding: bool
 
 
-RUN_BUTTONS = {
-    "Play": Action.PLAY, "Pause": Action.PAUSE, "Step": Action.STEP, "Reset": Action.RESET,
-}  # fmt: skip
-VIEW_BUTTONS = {
-    "Top": Action.TOP, "Front": Action.FRONT, "Side": Action.SIDE, "Fit": Action.FIT,
-}  # fmt: skip
-HISTORY_BUTTONS = {"Undo": Action.UNDO, "Redo": Action.REDO}
+RUN_BUTTONS = ("Play", "Pause", "Step", "Reset")
+HISTORY_BUTTONS = ("Undo", "Redo")
 COMMANDS = {
-    "Look from the top": (Action.TOP, "1", None),
-    "Look from the front": (Action.FRONT, "2", None),
-    "Look from the side": (Action.SIDE, "3", None),
-    "Fit the whole map into the window": (Action.FIT, "0", None),
-    "Follow the camera, or stop following": (Action.FOLLOW, "F", None),
-    "Undo the last edit": (Action.UNDO, "Z", "cmd/ctrl"),
-    "Redo the edit": (Action.REDO, "Z", "cmd/ctrl+shift"),
+    "Look from the top": ("Top", "1", None),
+    "Look from the front": ("Front", "2", None),
+    "Look from the side": ("Side", "3", None),
+    "Fit the whole map into the window": ("Fit", "0", None),
+    "Follow the camera, or stop following": ("Follow", "F", None),
+    "Undo the last edit": ("Undo", "Z", "cmd/ctrl"),
+    "Redo the edit": ("Redo", "Z", "cmd/ctrl+shift"),
 }
 """Entries of the command palette: action, key, and the key that is held with it."""
-EDIT_BUTTONS = {
-    "On/off": Action.SWITCH,
-    "Freeze": Action.FREEZE,
-    "Move": Action.TOGGLE_GIZMO,
-    "Put back": Action.PUT_BACK,
-}
+EDIT_BUTTONS = ("On/off", "Freeze", "Move", "Put back")
 SAVE_BUTTONS = {
-    "Map": (
-        Action.SAVE_MAP,
-        "The map with its keyframes: a .npz file for `taichi-mrf live` and `MRFMap.load`.",
-    ),
-    "Voxels": (
-        Action.SAVE_VOXELS,
-        "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
-    ),
-    "Mesh": (
-        Action.SAVE_MESH,
-        "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
-    ),
-    "Picture": (Action.SAVE_PICTURE, "What this browser shows, as a .png file."),
-    "Page": (Action.SAVE_PAGE, "The scene as one .html file that any browser opens, without a server."),
-    "Recording": (Action.RECORD, "Start recording the scene; press again to get it as a .viser file."),
+    "Map": "The map with its keyframes: a .npz file for `taichi-mrf live` and `MRFMap.load`.",
+    "Voxels": "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
+    "Mesh": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
+    "Picture": "What this browser shows, as a .png file.",
+    "Page": "The scene as one .html file that any browser opens, without a server.",
+    "Recording": "Start recording the scene; press again to get it as a .viser file.",
 }
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
@@ -129,39 +73,6 @@ _MAP_OPTIONS = (
 TIME_STEP_S = 0.1
 
 
-@dataclass(frozen=True)
-class Question:
-    """Question before something that cannot be undone: ``yes`` does it, by ``action``."""
-
-    title: str
-    text: str
-    yes: str
-    no: str
-    action: Action
-
-
-RESET_QUESTION = Question(
-    "Reset the map?",
-    "This deletes the map and all edits of its keyframes, and maps the source again from its first frame. To "
-    "keep the map, save it first.",
-    "Delete the map and start again",
-    "Keep the map",
-    Action.RESET_CONFIRMED,
-)
-
-
-def freeze_question(keyframe: KeyframeInfo) -> Question:
-    """Before a keyframe is frozen."""
-    return Question(
-        "Freeze the keyframe?",
-        f"This makes the evidence of keyframe {keyframe.id} ({in_markdown(keyframe.name)}) permanent and "
-        "drops its image: it can never be switched off, moved or looked at again.",
-        "Freeze it",
-        "Leave it as it is",
-        Action.FREEZE_CONFIRMED,
-    )
-
-
 class Panel(BasePanel):
     """Adds the widgets, and shows values in them."""
 
@@ -170,13 +81,15 @@ class Panel(BasePanel):
         self._names: dict[str, int] = {}
         self._questions: dict[int, Any] = {}
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
-        self.speed: Any = gui.add_dropdown(
-            "Speed", list(SPEEDS), hint="Replay the recording at this multiple of its own pace."
-        )
-        self.watch(self.speed, Action.SPEED)
+        hint = "Replay the recording at this multiple of its own pace."
+        self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
         self.add_legend()
         self.add_counts()
-        self.add_buttons("View", VIEW_BUTTONS, "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.")
+        self.add_buttons(
+            "View",
+            ("Top", "Front", "Side", "Fit"),
+            "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.",
+        )
         self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
         self._options.add("follow")
         for label, command in COMMANDS.items():
@@ -200,8 +113,8 @@ class Panel(BasePanel):
         with tabs.add_tab("Images", viser.Icon.PHOTO):
             self._images_tab()
         with tabs.add_tab("Save", viser.Icon.DOWNLOAD):
-            for name, (action, hint) in SAVE_BUTTONS.items():
-                self.add_button(name, action, hint)
+            for name, hint in SAVE_BUTTONS.items():
+                self.add_button(name, hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._numbers = gui.add_html("")
             self.add_notices()
@@ -221,15 +134,13 @@ class Panel(BasePanel):
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
         )
-        self._edits.options = tuple(
-            label for label, action in EDIT_BUTTONS.items() if hello.can_freeze or action is not Action.FREEZE
-        )
+        self._edits.options = tuple(label for label in EDIT_BUTTONS if hello.can_freeze or label != "Freeze")
         self._offer_replay(hello.has_frames)
         self.clear_notices()
 
     def _offer_replay(self, has_frames: bool) -> None:
         """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
-        self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
+        self._run.options = RUN_BUTTONS if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
         self._options.handles["follow"].visible = has_frames
 
@@ -325,16 +236,14 @@ class Panel(BasePanel):
             picture.visible = False
         self._score.content = ""
 
-    def ask(self, client: viser.ClientHandle, question: Question) -> None:
-        """Ask one user to confirm what cannot be undone."""
+    def ask(self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str) -> None:
+        """Ask one user to confirm what cannot be undone: the action ``yes`` does it."""
         self.close_question(client.client_id)
-        modal = self._questions[client.client_id] = client.gui.add_modal(question.title)
+        modal = self._questions[client.client_id] = client.gui.add_modal(title)
         with modal:
-            client.gui.add_markdown(question.text)
-            yes = client.gui.add_button(question.yes, color="red")
-            yes.on_click(partial(self._used, action=question.action))
-            no = client.gui.add_button(question.no)
-            no.on_click(partial(self._used, action=Action.CANCELLED))
+            client.gui.add_markdown(text)
+            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, yes))
+            client.gui.add_button(no).on_click(lambda event: self.used(event, no))
 
     def close_question(self, client: int) -> None:
         """Close the question."""
@@ -344,18 +253,13 @@ class Panel(BasePanel):
 
     def _keyframe_tab(self) -> None:
         gui = self.gui
-        self.keyframe: Any = gui.add_dropdown(
-            "Keyframe", [NO_KEYFRAME], hint="The keyframe that the buttons change. Its frustum is magenta."
-        )
-        self.watch(self.keyframe, Action.CHOOSE_KEYFRAME)
+        hint = "The keyframe that the buttons change. Its frustum is magenta."
+        self.keyframe = self.watch(gui.add_dropdown("Keyframe", [NO_KEYFRAME], hint=hint))
         self._edits: Any = self.add_buttons("Edit", EDIT_BUTTONS)
-        self.position: Any = gui.add_vector3(
-            "Position (m)",
-            (0.0, 0.0, 0.0),
-            step=POSITION_STEP_M,
-            hint="Position of the keyframe's camera in the world; type another one to move the keyframe.",
+        hint = "Position of the keyframe's camera in the world; type another one to move the keyframe."
+        self.position = self.watch(
+            gui.add_vector3("Position (m)", (0.0, 0.0, 0.0), step=POSITION_STEP_M, hint=hint)
         )
-        self.watch(self.position, Action.SET_POSITION)
         self._keyframe_text = gui.add_markdown("")
         gui.add_markdown(
             "**On/off** removes the keyframe from the map, or adds it again. **Freeze** asks, and then makes "
@@ -368,15 +272,14 @@ class Panel(BasePanel):
             "Pixel (u, v)", (0.0, 0.0), step=1.0, hint="Column and row in the image of the chosen keyframe."
         )
         hint = "Show what the ray of this pixel of the chosen keyframe passes through."
-        self._pixel_button: Any = self.add_button("Show the ray", Action.SHOW_PIXEL_RAY, hint)
+        self._pixel_button: Any = self.add_button("Show the ray", hint)
         self.ray = RayPlot(self.gui, scene)
 
     def _images_tab(self) -> None:
         gui = self.gui
-        self.images = gui.add_checkbox("Show images", False, hint="Keep them up to date while mapping.")
-        self.view = gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME])
-        for widget in (self.images, self.view):
-            self.watch(widget, Action.WATCH_IMAGES)
+        hint = "Keep them up to date while mapping."
+        self.images = self.watch(gui.add_checkbox("Show images", False, hint=hint))
+        self.view = self.watch(gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
         self._score = gui.add_markdown("")
         black = np.zeros((2, 2, 3), np.uint8)
         self._measured = gui.add_image(black, label="measured depth", visible=False)
@@ -403,17 +306,14 @@ class TimeFolder:
         self._latest: tuple[SceneChange, ...] = ()
         self.folder = gui.add_folder("Time", visible=False)
         with self.folder:
-            self.slider: Any = gui.add_slider(
-                "Time (s)",
-                min=0.0,
-                max=TIME_STEP_S,
-                step=TIME_STEP_S,
-                initial_value=TIME_STEP_S,
-                disabled=True,
-                hint="Show the map as it was believed at this time, in all browsers. The right end is now "
-                "and follows new keyframes. An edit returns to now.",
+            hint = (
+                "Show the map as it was believed at this time, in all browsers. The right end is now "
+                "and follows new keyframes. An edit returns to now."
             )
-            panel.watch(self.slider, Action.SHOW_TIME)
+            least, most, now = 0.0, TIME_STEP_S, TIME_STEP_S
+            self.slider = panel.watch(
+                gui.add_slider("Time (s)", least, most, TIME_STEP_S, now, disabled=True, hint=hint)
+            )
             self._list = gui.add_html("", visible=False)
             gui.add_html(dynamic_legend_html())
 

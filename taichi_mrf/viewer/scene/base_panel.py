@@ -1,8 +1,7 @@
 """The widgets that both pages have: what is being done, counts, legend, notices; and how widgets of an action
 are added."""
 
-from collections.abc import Callable, Iterable, Mapping
-from enum import Enum
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import viser
@@ -10,7 +9,7 @@ import viser
 from taichi_mrf.viewer.messages import Notice
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.widgets import in_html
-from taichi_mrf.viewer.transport.process import Event, OptionsMoved, Used
+from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
 Tell = Callable[[Event], None]
@@ -63,26 +62,28 @@ class BasePanel:
         """Add the list of the latest notices."""
         self._notice_list = self.gui.add_html("")
 
-    def add_button(self, label: str, action: Enum, hint: str | None = None, **options: Any) -> Any:
-        """Add a button."""
+    def add_button(self, label: str, hint: str | None = None, action: str = "", **options: Any) -> Any:
+        """Add a button, whose action has the name that is written on it unless ``action`` is given."""
         button = self.gui.add_button(label, hint=hint, **options)
-        button.on_click(lambda event: self._used(event, action))
+        button.on_click(lambda event: self.used(event, action or label))
         return button
 
-    def add_buttons(self, label: str, actions: Mapping[str, Enum], hint: str | None = None) -> Any:
-        """Add a row of buttons: what is written on each, and its action."""
+    def add_buttons(self, label: str, actions: Sequence[str], hint: str | None = None) -> Any:
+        """Add a row of buttons: the action of each has the name that is written on it."""
         group = self.gui.add_button_group(label, tuple(actions), hint=hint)
-        group.on_click(lambda event: self._used(event, actions[event.target.value]))
+        group.on_click(lambda event: self.used(event, event.target.value))
         return group
 
-    def add_command(self, label: str, action: Enum, key: Any, modifier: Any = None) -> None:
+    def add_command(self, label: str, action: str, key: Any, modifier: Any = None) -> None:
         """Add an entry of the command palette (Ctrl-K) with a key; keys do nothing while text is typed."""
         command = self.gui.add_command(label, hotkey=key, modifier=modifier)
-        command.on_trigger(lambda event: self._used(event, action))
+        command.on_trigger(lambda event: self.used(event, action))
 
-    def watch(self, widget: Any, action: Enum) -> None:
-        """Take each change of a widget's value by a user as this action; the page's own changes are none."""
-        widget.on_update(lambda event: self._used(event, action))
+    def watch(self, widget: Any) -> Any:
+        """Take each change of a widget's value by a user as the action of the widget's label; the page's own
+        changes are none. Returns the widget."""
+        widget.on_update(lambda event: self.used(event, widget.label))
+        return widget
 
     def show_activity(self, text: str, share: float, moving: bool) -> None:
         """Show what is being done and how much of it is, 0 to 1; ``moving`` animates the bar."""
@@ -114,7 +115,8 @@ class BasePanel:
         self._notices.clear()
         self._notice_list.content = notices_html([])
 
-    def _used(self, event: viser.GuiEvent | viser.CommandEvent, action: Enum) -> None:
+    def used(self, event: Any, action: str) -> None:
+        """Callback of what a user does with viser's widgets."""
         if event.client_id is not None:
             self._tell(Used(action, event.client_id))
 

@@ -8,7 +8,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,22 +19,10 @@ from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ViewOptions
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, in_html, in_markdown
-from taichi_mrf.viewer.transport.process import Event
+from taichi_mrf.viewer.transport.inbox import Event
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
-
-
-class Action(Enum):
-    """A button, or a widget whose value asks the tuning process for something."""
-
-    STOP_SEARCH = auto()
-    USE_FRAMES = auto()
-    CHOOSE_VIEW = auto()
-    RESTORE = auto()
-    PIN = auto()
-    SAVE_YAML = auto()
-    SAVE_CSV = auto()
 
 
 @dataclass(frozen=True)
@@ -45,14 +32,10 @@ class KnobMoved(Event):
     name: str
 
 
-TRY_BUTTONS = {"Restore": Action.RESTORE, "Pin": Action.PIN}
 SAVE_BUTTONS = {
-    "Save YAML": (
-        Action.SAVE_YAML,
-        "The parameters of the selected try, with its scores as a comment: for `map --config` and `live "
-        "--config`.",
-    ),
-    "Save CSV": (Action.SAVE_CSV, "The table of all tries with their parameters and scores."),
+    "Save YAML": "The parameters of the selected try, with its scores as a comment: for `map --config` and "
+    "`live --config`.",
+    "Save CSV": "The table of all tries with their parameters and scores.",
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
@@ -86,7 +69,7 @@ class TunePanel(BasePanel):
         self._last_shown: int | None = None
         self._knobs: list[KnobWidgets] = []
         self._folders: dict[str, Any] = {}
-        self._stop = self.add_button("Stop the search", Action.STOP_SEARCH, visible=False)
+        self._stop = self.add_button("Stop the search", visible=False)
         self.add_counts()
         self._scores = gui.add_html("")
         tabs = gui.add_tab_group()
@@ -113,7 +96,7 @@ class TunePanel(BasePanel):
             self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
             self._frames.add()
             hint = "Start again with these frames. The table of tries is emptied."
-            self.add_button("Use these frames", Action.USE_FRAMES, hint)
+            self.add_button("Use these frames", hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._about = gui.add_html("")
             self.add_notices()
@@ -217,10 +200,8 @@ class TunePanel(BasePanel):
 
     def _views_tab(self) -> None:
         gui = self.gui
-        self.view: Any = gui.add_dropdown(
-            "Held-out view", [NONE_YET], hint="A frame that is not in the map and scores it."
-        )
-        self.watch(self.view, Action.CHOOSE_VIEW)
+        hint = "A frame that is not in the map and scores it."
+        self.view = self.watch(gui.add_dropdown("Held-out view", [NONE_YET], hint=hint))
         gui.add_markdown("Right (blue), wrong (orange), no surface (light), not judged (dark).")
         black = np.zeros((2, 2, 3), np.uint8)
         self._reference_text = gui.add_markdown("")
@@ -237,9 +218,9 @@ class TunePanel(BasePanel):
         self.attempt: Any = gui.add_dropdown(
             "Selected try", [NONE_YET], hint="The try that the buttons use, with what it changed."
         )
-        self.add_buttons("Try", TRY_BUTTONS)
-        for name, (action, hint) in SAVE_BUTTONS.items():
-            self.add_button(name, action, hint)
+        self.add_buttons("Try", ("Restore", "Pin"))
+        for name, hint in SAVE_BUTTONS.items():
+            self.add_button(name, hint)
         gui.add_markdown(
             "**Restore** sets the sliders to the selected try and maps with it again. **Pin** makes it the "
             "reference (A): scores and pictures of other tries are compared with it."
