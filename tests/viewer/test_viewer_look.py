@@ -86,9 +86,9 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     scale, store = scale_of("photo", 0.5, HEIGHTS), VoxelStore()
     bricks = np.array([[0, 0, 0], [0, 0, 1], [9, 0, 0]], np.int32)
     colors = np.random.default_rng(0).integers(0, 255, (3, 512, 3)).astype(np.uint8)
-    store.paint(bricks[:2], colors[:2])  # may come before the voxels, which are hidden until then
+    store.put(bricks[:2], colors=colors[:2])  # may come before the voxels, which are hidden until then
     assert not len(store.shown((0, 0, 0), 0.0, None).cells)
-    assert store.put(bricks, np.full((3, 512), 100, np.int16), np.ones((3, 512), np.uint8))
+    assert store.put(bricks, log_odds=np.full((3, 512), 100, np.int16), seen=np.ones((3, 512), np.uint8))
     seen = store.shown((0, 0, 0), 0.0, None)
     np.testing.assert_array_equal(voxel_colors(scale, seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
     unseen = store.shown((1, 0, 0), 0.0, None)
@@ -119,7 +119,7 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
-    large.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    large.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
     by_marginal, by_height = ViewOptions(color_by="marginal"), ViewOptions()
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
@@ -139,7 +139,7 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
 )
 def test_every_option_of_the_voxels_makes_another_look(changes: dict[str, Any]) -> None:
     store = VoxelStore()
-    store.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    store.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
     options = ViewOptions()
     before = look_of(options, store, (2, 1), 0.05)
     assert look_of(dataclasses.replace(options, **changes), store, (2, 1), 0.05) != before
@@ -269,7 +269,7 @@ def test_an_empty_ray_has_curves_too() -> None:
 def test_packed_steps_are_what_the_store_compares_with() -> None:
     store = VoxelStore()
     values = np.full((1, 512), round(0.4 / LOG_ODDS_STEP), np.int16)
-    store.put(np.zeros((1, 3), np.int32), values, np.zeros((1, 512), np.uint8))
+    store.put(np.zeros((1, 3), np.int32), log_odds=values)
     p = 1 / (1 + math.exp(-0.39))
     assert len(store.shown((0, 0, 0), math.log(p / (1 - p)), None).cells) == 512
     assert len(store.shown((0, 0, 0), 0.41, None).cells) == 0

@@ -108,13 +108,14 @@ class MapScene:
         """Take in changed bricks; :meth:`flush` draws them."""
         layer: Layer = "map" if bricks.layer == "dynamic" else bricks.layer
         store = self.layers[layer].dynamic if bricks.layer == "dynamic" else self.layers[layer].store
-        changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
+        changed = store.put(bricks.bricks, log_odds=bricks.log_odds, seen=bricks.seen)
+        changed |= store.remove(bricks.removed)
         self._dirty[layer] |= changed
         self._news_at = time.monotonic()
 
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""
-        self._dirty["map"] |= self.store.paint(colors.bricks, colors.colors)
+        self._dirty["map"] |= self.store.put(colors.bricks, colors=colors.colors)
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:
