@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viser.transforms as vtf
 
 from taichi_mrf.geometry.poses import as_pose, look_at
 from taichi_mrf.geometry.up import up_of, up_vector
@@ -22,7 +23,7 @@ from taichi_mrf.viewer.scene.coloring import (
     scale_of,
     voxel_colors,
 )
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement, border
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, border, placement
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_layer import look_of
@@ -157,9 +158,9 @@ def keyframe(id: int, T_world_camera: np.ndarray, camera: Camera = CAMERA) -> Ke
 
 def test_a_click_on_a_picture_finds_its_pixel() -> None:
     rng = np.random.default_rng(3)
-    place = Placement(rng.normal(size=4), rng.normal(size=3))
-    place = Placement(place.wxyz / np.linalg.norm(place.wxyz), place.position)
-    T = place.pose()
+    wxyz_xyz = rng.normal(size=7)
+    wxyz_xyz[:4] /= np.linalg.norm(wxyz_xyz[:4])
+    T = vtf.SE3(wxyz_xyz).as_matrix()
     u, v = 12.0, 40.0
     on_picture = FRUSTUM_M * np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0])
     point = T[:3, :3] @ on_picture + T[:3, 3]
@@ -169,7 +170,7 @@ def test_a_click_on_a_picture_finds_its_pixel() -> None:
     assert (hit.keyframe, round(hit.u, 6), round(hit.v, 6)) == (7, u, v)
     assert hit.range_m == pytest.approx(np.linalg.norm(point - eye))
     assert first_pixel(eye, eye - point, [keyframe(7, T)]) is None
-    np.testing.assert_allclose(Placement.of(T).pose(), T, atol=1e-12)
+    np.testing.assert_allclose(vtf.SE3(np.concatenate(placement(T))).as_matrix(), T, atol=1e-12)
 
 
 LIDAR = SphericalCamera(np.linspace(0.5, -0.5, 12), np.linspace(3.0, -3.0, 60))

@@ -129,7 +129,7 @@ def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: LivePage) -> Non
     handled.take(replace(HELLO, has_frames=False))
     assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
-    assert not panel._options.handles["follow"].visible
+    assert not panel.view_options.handles["follow"].visible
 
 
 def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> None:
@@ -141,7 +141,7 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
 
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
-    colors = handled.page.panel._options.handles["color_by"]
+    colors = handled.page.panel.view_options.handles["color_by"]
     assert list(colors.options) == ["marginal", "height", "uncertainty", "keyframes"]
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
     assert list(colors.options) == ["marginal", "height", "uncertainty", "photo"]
@@ -210,8 +210,8 @@ def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage)
 
 
 def follow(handled: LivePage, on: bool = True) -> None:
-    handled.page.panel._options.handles["follow"].value = on
-    before, handled.page.options = handled.page.options, handled.page.panel.options()
+    handled.page.panel.view_options.handles["follow"].value = on
+    before, handled.page.options = handled.page.options, handled.page.panel.view_options.value()
     handled.page.options_changed(before)
 
 

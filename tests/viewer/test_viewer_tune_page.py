@@ -32,7 +32,7 @@ class HandledTunePage(HandledPage):
         self.page.batch_done()
 
     def slider(self, name: str) -> Any:
-        return next(each for each in self.page.panel._knobs if name in each)._handles[name]
+        return self.page.panel._knobs._handles[name]
 
     def move(self, name: str, value: float) -> KnobMoved:
         self.slider(name).value = value

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import viser
+import viser.transforms as vtf
 
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
@@ -20,7 +21,6 @@ from taichi_mrf.viewer.live.panel import (
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.keyframe_layer import Placement
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import in_markdown
@@ -127,7 +127,7 @@ class Page(BasePage[Panel]):
         self.panel.ray.clear()
         self.panel.show_hello(hello)
         self.panel.show_keyframes({}, None)
-        self.options = self.panel.options()  # what this map cannot show is not offered any more
+        self.options = self.panel.view_options.value()  # what this map cannot show is not offered any more
         if self._extras(self.options) != self._extras(_PLAIN):
             self._ask_for_extras()
 
@@ -300,8 +300,8 @@ class Page(BasePage[Panel]):
         self.keyframes.held = dragged.holding
         gizmo, keyframe = self.keyframes.gizmo, self.keyframes.chosen
         if gizmo is not None and keyframe is not None and not dragged.holding:
-            place = Placement(np.array(gizmo.wxyz), np.array(gizmo.position))
-            self._make(m.Move(keyframe, place.pose()))
+            pose = vtf.SE3(np.array([*gizmo.wxyz, *gizmo.position], np.float64))
+            self._make(m.Move(keyframe, np.asarray(pose.as_matrix(), np.float64)))
 
     def _choose(self, keyframe: int | None) -> None:
         if keyframe == self.keyframes.chosen:

@@ -20,7 +20,7 @@ from taichi_mrf.viewer.messages import (
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html, in_markdown
+from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
 from taichi_mrf.viewer.transport.inbox import Event
 
 
@@ -90,8 +90,7 @@ class Panel(BasePanel):
             ("Top", "Front", "Side", "Fit"),
             "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.",
         )
-        self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
-        self._options.add("follow")
+        self.view_options.add("follow")
         for label, command in COMMANDS.items():
             self.add_command(label, *command)
         hint = "Ctrl-Z takes the last edit back, Ctrl-Shift-Z makes it again; a frozen keyframe stays."
@@ -99,13 +98,13 @@ class Panel(BasePanel):
         self.show_history(False, False)
         self.time = TimeFolder(gui, self)
         with self.time.folder:
-            self._options.add("dynamic")
+            self.view_options.add("dynamic")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
-            self._options.add(*_MAP_OPTIONS)
+            self.view_options.add(*_MAP_OPTIONS)
             with gui.add_folder("Space"):
-                self._options.add("ground", "axes")
-            self._options.add("pictures", "dark")
+                self.view_options.add("ground", "axes")
+            self.view_options.add("pictures", "dark")
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
         with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
@@ -120,16 +119,12 @@ class Panel(BasePanel):
             self.add_notices()
             self._parameters = gui.add_html("")
 
-    def options(self) -> ViewOptions:
-        """The view options as the widgets stand."""
-        return self._options.value()
-
     def show_hello(self, hello: Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
-        self._options.offer("color_by", _colors_of(hello))
-        self._options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
+        self.view_options.offer("color_by", _colors_of(hello))
+        self.view_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -142,7 +137,7 @@ class Panel(BasePanel):
         """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
         self._run.options = RUN_BUTTONS if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
-        self._options.handles["follow"].visible = has_frames
+        self.view_options.handles["follow"].visible = has_frames
 
     def show_history(self, can_undo: bool, can_redo: bool) -> None:
         """Offer to take edits back, and to make them again, if there are any."""
@@ -154,12 +149,12 @@ class Panel(BasePanel):
 
     def set_following(self, on: bool | None = None) -> None:
         """Set the box that follows the camera; None turns it over."""
-        box = self._options.handles["follow"]
+        box = self.view_options.handles["follow"]
         box.value = (not box.value) if on is None else on
 
     def color_by_photo(self) -> None:
         """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
-        widget = self._options.handles["color_by"]
+        widget = self.view_options.handles["color_by"]
         if widget.value == ViewOptions().color_by:
             widget.value = "photo"
 

@@ -117,7 +117,7 @@ class BasePage(Generic[P]):
         time.sleep(_HEAD_START_S)
 
     def _take_options(self) -> None:
-        before, self.options = self.options, self.panel.options()
+        before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
         if self.options.dark != before.dark:

@@ -8,7 +8,7 @@ import viser
 
 from taichi_mrf.viewer.messages import Notice
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.widgets import in_html
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html
 from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
@@ -38,17 +38,10 @@ class BasePanel:
     def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
         self.gui, self._tell = gui, tell
+        self.view_options = OptionWidgets(gui, ViewOptions(), lambda: tell(OptionsMoved()))
         self._notices: list[Notice] = []
         self._activity = gui.add_html(_activity_html("Starting …"))
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
-
-    def options(self) -> ViewOptions:
-        """The view options as the widgets stand."""
-        raise NotImplementedError
-
-    def options_moved(self) -> None:
-        """Callback of the widgets of view options, for when one of them was used."""
-        self._tell(OptionsMoved())
 
     def add_counts(self) -> None:
         """Add the line that says how many voxels the page shows."""

@@ -1,8 +1,6 @@
 """Keyframes that the page keeps, and in the scene: small frusta or rings with their depth images, the
 camera's path, the current camera."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import viser
 import viser.transforms as vtf
@@ -31,25 +29,10 @@ CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """A pose as viser takes it."""
-
-    wxyz: NDArray[np.float64]
-    position: NDArray[np.float64]
-
-    @staticmethod
-    def of(T_world_camera: Pose) -> "Placement":
-        """The rotation as a unit quaternion, w first, and the position in metres."""
-        wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
-        return Placement(wxyz, T_world_camera[:3, 3])
-
-    def pose(self) -> Pose:
-        """The pose as a (4, 4) matrix."""
-        T = np.eye(4)
-        T[:3, :3] = vtf.SO3(np.asarray(self.wxyz, np.float64)).as_matrix()
-        T[:3, 3] = self.position
-        return T
+def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A pose as viser takes it: the rotation as a unit quaternion, w first, and the position in metres."""
+    wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
+    return wxyz, T_world_camera[:3, 3]
 
 
 class ShownKeyframes:
@@ -174,9 +157,9 @@ class KeyframeLayer:
         """Put a gizmo on the chosen keyframe. There must be one."""
         self.release()
         assert self.chosen is not None
-        place = Placement.of(self.keyframes[self.chosen].T_world_camera)
+        wxyz, position = placement(self.keyframes[self.chosen].T_world_camera)
         self.gizmo = self._scene.add_transform_controls(
-            "/gizmo", scale=0.5, depth_test=False, wxyz=place.wxyz, position=place.position
+            "/gizmo", scale=0.5, depth_test=False, wxyz=wxyz, position=position
         )
         return self.gizmo
 
@@ -194,8 +177,7 @@ class KeyframeLayer:
         if keyframe.state == "frozen":
             self.release()
             return
-        place = Placement.of(keyframe.T_world_camera)
-        self.gizmo.wxyz, self.gizmo.position = place.wxyz, place.position
+        self.gizmo.wxyz, self.gizmo.position = placement(keyframe.T_world_camera)
 
     def clear(self) -> None:
         """Remove all keyframes."""
@@ -253,7 +235,7 @@ class KeyframeLayer:
         picture: NDArray[np.uint8] | None = None,
     ) -> viser.CameraFrustumHandle | viser.LineSegmentsHandle:
         """A frustum, or what a camera without a flat image sees on a sphere: rings."""
-        place = Placement.of(T_world_camera)
+        wxyz, position = placement(T_world_camera)
         if not isinstance(camera, PinholeCamera):
             return self._scene.add_line_segments(
                 name,
@@ -261,8 +243,8 @@ class KeyframeLayer:
                 color,
                 thickness=thickness,
                 thickness_units="screen",
-                wxyz=place.wxyz,
-                position=place.position,
+                wxyz=wxyz,
+                position=position,
             )
         fov, aspect = _view_angles(camera)
         return self._scene.add_camera_frustum(
@@ -278,8 +260,8 @@ class KeyframeLayer:
             jpeg_quality=70,
             cast_shadow=False,
             receive_shadow=False,
-            wxyz=place.wxyz,
-            position=place.position,
+            wxyz=wxyz,
+            position=position,
         )
 
 

@@ -15,7 +15,7 @@ from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
-from taichi_mrf.viewer.scene.voxel_layer import CutPlane, Look, VoxelLayer, cut_picture, look_of
+from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 
@@ -35,7 +35,6 @@ _SQUARES_ACROSS = 8
 
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 _OUTLINE_COLOR = (120, 120, 120)
-_OUTLINE_NODE = "/bricks"
 _GROUND_COLOR = (160, 165, 172)
 
 
@@ -53,8 +52,6 @@ class MapScene:
         self._surface_wanted = False
         self.growing = False
         """True while frames are read: a surface that was made before lacks what they add."""
-        self._cut_plane = CutPlane(server.scene, hello.voxel_size)
-        self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self.ground = Ground(server.scene)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
         self._all_dirty = True
@@ -128,11 +125,9 @@ class MapScene:
         for layer in self.layers.values():
             layer.clear()
         self.surface.clear()
-        self._cut_plane.hide()
-        self._brick_lines.hide()
         self.ground.hide()
-        for name in _NAMES:
-            self._server.scene.remove_by_name(f"/names/{name}")
+        for name in ("/cut", "/bricks", *(f"/names/{layer}" for layer in _NAMES)):
+            self._server.scene.remove_by_name(name)
 
     def patience(self) -> float | None:
         """Seconds until :meth:`flush` has something to do if no update comes; None if it has nothing to
@@ -180,7 +175,7 @@ class MapScene:
             self._show_surface(self.shows_surface)
             if map_changed:
                 self._draw_cut(look, crossed)
-                self._brick_lines.show(self.store.bricks() if options.bricks else None)
+                self._draw_bricks(options.bricks)
                 self._show_space(options, up)
             if any_changed:
                 self.layers["baseline"].place(self._baseline_m(up))
@@ -208,13 +203,23 @@ class MapScene:
             self._server.scene.world_axes.visible = options.axes
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
+        hello, scene = self._hello, self._server.scene
         if look.cut is None:
-            self._cut_plane.hide()
+            scene.remove_by_name("/cut")
             return
-        picture = cut_picture(
-            self.store, look.cut, self._hello.prior_log_odds, self._hello.min_evidence, crossed
+        picture = cut_picture(self.store, look.cut, hello.prior_log_odds, hello.min_evidence, crossed)
+        show_cut(scene, hello.voxel_size, self.store, look.cut, picture)
+
+    def _draw_bricks(self, wanted: bool) -> None:
+        """Draw the outlines of the map's bricks if they are ``wanted``."""
+        bricks = self.store.bricks()
+        if not wanted or not len(bricks):
+            self._server.scene.remove_by_name("/bricks")
+            return
+        lines = (brick_edges(bricks) * BRICK * self._hello.voxel_size).astype(np.float32)
+        self._server.scene.add_line_segments(
+            "/bricks", lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
         )
-        self._cut_plane.show(self.store, look.cut, picture)
 
     def _draw_names(self, up: Up) -> None:
         """Put a label above each map if there are two."""
@@ -257,30 +262,6 @@ def brick_edges(bricks: NDArray[np.int64]) -> NDArray[np.int64]:
     unique = np.unique(np.concatenate(edges), axis=0)
     start, axes = unique[:, :3], unique[:, 3]
     return np.stack([start, start + np.eye(3, dtype=np.int64)[axes]], axis=1)
-
-
-class BrickLines:
-    """Owns the lines in the scene."""
-
-    def __init__(self, scene: viser.SceneApi, voxel_size: float) -> None:
-        self._scene, self._voxel_size = scene, voxel_size
-        self._node: viser.LineSegmentsHandle | None = None
-
-    def show(self, bricks: NDArray[np.int64] | None) -> None:
-        """Draw the outlines of bricks (n, 3); no bricks, or None, remove them."""
-        if bricks is None or not len(bricks):
-            self.hide()
-            return
-        lines = (brick_edges(bricks) * BRICK * self._voxel_size).astype(np.float32)
-        self._node = self._scene.add_line_segments(
-            _OUTLINE_NODE, lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
-        )
-
-    def hide(self) -> None:
-        """Remove the lines from the scene."""
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
 
 
 def square_m(extent_m: float) -> float:

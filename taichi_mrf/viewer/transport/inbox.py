@@ -39,23 +39,16 @@ class Used(Event):
 Item = Update | Event | None
 
 
-class Inbox:
+class Inbox(queue.SimpleQueue[Item]):
     """A queue that any thread may fill."""
-
-    def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
-
-    def put(self, item: Item) -> None:
-        """Add one item; returns at once."""
-        self._queue.put(item)
 
     def wait(self, patience_s: float | None) -> list[Item]:
         """All items in the queue. Waits for the first one for at most ``patience_s`` seconds (None: without
         limit), and returns an empty list if none has come by then."""
         try:
-            batch = [self._queue.get(timeout=patience_s)]
+            batch = [self.get(timeout=patience_s)]
         except queue.Empty:
             return []
-        while not self._queue.empty():
-            batch.append(self._queue.get())
+        while not self.empty():
+            batch.append(self.get())
         return batch
