@@ -60,7 +60,7 @@ def write_page(
         if bounds is not None:
             options = ViewOptions(color_by=color_by, threshold=threshold)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
-            layer.prepare(layer.all_chunks(), look, exactly=True)
+            layer.prepare(look, everything=True, exactly=True)
             layer.send()
             if cells:
                 add_cells(server.scene, layer.store, look, m.voxel_size, prior + min_evidence)

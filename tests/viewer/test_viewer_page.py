@@ -18,9 +18,9 @@ from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.answer import SWITCHES
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.live.panel import COMMANDS, Dragged
+from taichi_mrf.viewer.scene.base_panel import Joined
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.transport import downloads
-from taichi_mrf.viewer.transport.inbox import Joined
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")

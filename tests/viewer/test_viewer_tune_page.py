@@ -8,7 +8,7 @@ import pytest
 from handled_page import HandledPage
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.viewer.transport.inbox import Used
+from taichi_mrf.viewer.scene.base_panel import Used
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.messages import Scores
 from taichi_mrf.viewer.tune.page import TunePage

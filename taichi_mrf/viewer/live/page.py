@@ -20,11 +20,11 @@ from taichi_mrf.viewer.live.panel import (
     Panel,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
+from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import in_markdown
-from taichi_mrf.viewer.transport.inbox import Inbox
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
@@ -70,10 +70,10 @@ class Page(BasePage[Panel]):
             "Pause": lambda client: ask(m.Pause(True)),
             "Step": lambda client: ask(m.Step()),
             "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
-            "Top": lambda client: self._look_from(client, "top"),
-            "Front": lambda client: self._look_from(client, "front"),
-            "Side": lambda client: self._look_from(client, "side"),
-            "Fit": lambda client: self._look_from(client, "here"),
+            "Top": partial(self._look_from, "top"),
+            "Front": partial(self._look_from, "front"),
+            "Side": partial(self._look_from, "side"),
+            "Fit": partial(self._look_from, "here"),
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
             "Delete the map and start again": self._reset_confirmed,
@@ -109,7 +109,7 @@ class Page(BasePage[Panel]):
         if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
 
-    def _look_from(self, client: int, side: Side) -> None:
+    def _look_from(self, side: Side, client: int) -> None:
         """Show the whole map to one client, and follow the camera no more."""
         self.panel.set_following(False)
         self._take_options()

@@ -17,11 +17,10 @@ from taichi_mrf.viewer.messages import (
     Status,
     TimeSpan,
 )
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
-from taichi_mrf.viewer.transport.inbox import Event
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.base_panel import BasePanel, pop_up
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used, pop_up
 from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
-from taichi_mrf.viewer.transport.inbox import Inbox, Item, Joined, OptionsMoved, Used
 from taichi_mrf.viewer.transport.pulse import Pulse
 from taichi_mrf.viewer.transport.server import start_server
 

@@ -1,16 +1,65 @@
-"""The widgets that both pages have: what is being done, counts, legend, notices; and how widgets of an action
-are added."""
+"""The widgets that both pages have: what is being done, counts, legend, notices; how widgets of an action are
+added; and the events that their use puts into the page's inbox.
 
+Updates come into the inbox from the mapping process, events from the browsers; None ends the page, whose own
+thread takes them out. viser runs callbacks on a pool of threads: a callback only puts an event into it.
+"""
+
+import queue
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import viser
 
-from taichi_mrf.viewer.messages import Notice
+from taichi_mrf.viewer.messages import Notice, Update
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html
-from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
+
+
+class Event:
+    """Base of what a user or a browser does; the pages add their own."""
+
+
+@dataclass(frozen=True)
+class Joined(Event):
+    """A browser has connected."""
+
+    client: int
+
+
+@dataclass(frozen=True)
+class OptionsMoved(Event):
+    """A widget of the view options was used; the latest values count."""
+
+
+@dataclass(frozen=True)
+class Used(Event):
+    """A client used the widget of an action: it pressed the button, or changed the value. The action has the
+    name of the widget."""
+
+    action: str
+    client: int
+
+
+Item = Update | Event | None
+
+
+class Inbox(queue.SimpleQueue[Item]):
+    """A queue that any thread may fill."""
+
+    def wait(self, patience_s: float | None) -> list[Item]:
+        """All items in the queue. Waits for the first one for at most ``patience_s`` seconds (None: without
+        limit), and returns an empty list if none has come by then."""
+        try:
+            batch = [self.get(timeout=patience_s)]
+        except queue.Empty:
+            return []
+        while not self.empty():
+            batch.append(self.get())
+        return batch
+
 
 Tell = Callable[[Event], None]
 

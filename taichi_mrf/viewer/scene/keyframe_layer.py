@@ -100,9 +100,6 @@ class KeyframeLayer:
         self.gizmo: viser.TransformControlsHandle | None = None
         self.held = False
         """True while a user drags the gizmo."""
-        self._frusta: dict[int, viser.CameraFrustumHandle | viser.LineSegmentsHandle] = {}
-        self._on_spheres: dict[int, viser.PointCloudHandle] = {}
-        """The pictures of keyframes that have no frustum."""
         # viser remembers each name that was ever removed, so names are used again.
         self._places: dict[int, int] = {}
         self._free_places: list[int] = []
@@ -117,9 +114,8 @@ class KeyframeLayer:
         """Show a keyframe that is new or has changed."""
         forgotten = self.roster.put(keyframe)
         for id in forgotten:
-            self._take_off_picture(id)
-            del self._frusta[id]  # its node is the next one's
-            self._free_places.append(self._places.pop(id))
+            self._scene.remove_by_name(f"{self._name(id)}/picture")
+            self._free_places.append(self._places.pop(id))  # its node is the next one's
         if self.chosen in forgotten:
             self.release()
             self.chosen = min(self.keyframes)
@@ -132,14 +128,14 @@ class KeyframeLayer:
         """Mark a keyframe as the one that the buttons change."""
         before, self.chosen = self.chosen, id
         for each in (before, id):
-            if each in self._frusta:
+            if each in self._places:
                 self._draw(self.keyframes[each])
 
     def show_pictures(self, on: bool) -> None:
         """Show the depth images in the frusta, or hide them."""
         if on != self._pictures:
             self._pictures = on
-            for id in list(self._frusta):
+            for id in list(self._places):
                 self._draw(self.keyframes[id])
 
     def draw_way(self) -> None:
@@ -182,10 +178,8 @@ class KeyframeLayer:
     def clear(self) -> None:
         """Remove all keyframes."""
         self.release()
-        for id, frustum in self._frusta.items():
-            self._take_off_picture(id)
-            frustum.remove()
-        self._frusta.clear()
+        for id in self._places:
+            self._scene.remove_by_name(self._name(id))
         self._places.clear()
         self._free_places.clear()
         self.roster = ShownKeyframes()
@@ -197,10 +191,10 @@ class KeyframeLayer:
         id, is_chosen = keyframe.id, keyframe.id == self.chosen
         if id not in self._places:
             self._places[id] = self._free_places.pop() if self._free_places else len(self._places)
-        name = f"/keyframes/{self._places[id]}"
+        name = self._name(id)
         picture = keyframe.picture if self._pictures and keyframe.state != "off" else None
         flat = isinstance(keyframe.camera, PinholeCamera)
-        self._frusta[id] = self._outline(
+        self._outline(
             name,
             keyframe.T_world_camera,
             keyframe.camera,
@@ -209,9 +203,9 @@ class KeyframeLayer:
             picture=picture if flat else None,
         )
         if flat or picture is None or picture.shape[:2] != keyframe.camera.shape:
-            self._take_off_picture(id)
+            self._scene.remove_by_name(f"{name}/picture")
         else:
-            self._on_spheres[id] = self._scene.add_point_cloud(
+            self._scene.add_point_cloud(
                 f"{name}/picture",
                 points=on_sphere(keyframe.camera, RING_M).reshape(-1, 3),
                 colors=picture.reshape(-1, 3),
@@ -220,9 +214,8 @@ class KeyframeLayer:
                 precision="float16",
             )
 
-    def _take_off_picture(self, id: int) -> None:
-        if id in self._on_spheres:
-            self._on_spheres.pop(id).remove()
+    def _name(self, id: int) -> str:
+        return f"/keyframes/{self._places[id]}"
 
     def _outline(
         self,
@@ -233,11 +226,11 @@ class KeyframeLayer:
         thickness: float,
         enlarged: float = 1.0,
         picture: NDArray[np.uint8] | None = None,
-    ) -> viser.CameraFrustumHandle | viser.LineSegmentsHandle:
-        """A frustum, or what a camera without a flat image sees on a sphere: rings."""
+    ) -> None:
+        """Draw a frustum, or what a camera without a flat image sees on a sphere: rings."""
         wxyz, position = placement(T_world_camera)
         if not isinstance(camera, PinholeCamera):
-            return self._scene.add_line_segments(
+            self._scene.add_line_segments(
                 name,
                 border(camera, enlarged * RING_M),
                 color,
@@ -246,8 +239,9 @@ class KeyframeLayer:
                 wxyz=wxyz,
                 position=position,
             )
+            return
         fov, aspect = _view_angles(camera)
-        return self._scene.add_camera_frustum(
+        self._scene.add_camera_frustum(
             name,
             fov,
             aspect,

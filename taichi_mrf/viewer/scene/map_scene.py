@@ -16,7 +16,7 @@ from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 
 UPDATES_PER_SECOND = 8
@@ -53,7 +53,6 @@ class MapScene:
         self.growing = False
         """True while frames are read: a surface that was made before lacks what they add."""
         self.ground = Ground(server.scene)
-        self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
         self._all_dirty = True
         self._look: Look | None = None
         self._news_at = self._sent_at = 0.0
@@ -103,16 +102,15 @@ class MapScene:
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
-        layer: Layer = "map" if bricks.layer == "dynamic" else bricks.layer
-        store = self.layers[layer].dynamic if bricks.layer == "dynamic" else self.layers[layer].store
-        changed = store.put(bricks.bricks, log_odds=bricks.log_odds, seen=bricks.seen)
-        changed |= store.remove(bricks.removed)
-        self._dirty[layer] |= changed
+        layer = self.layers["map" if bricks.layer == "dynamic" else bricks.layer]
+        store = layer.dynamic if bricks.layer == "dynamic" else layer.store
+        layer.changed |= store.put(bricks.bricks, log_odds=bricks.log_odds, seen=bricks.seen)
+        layer.changed |= store.remove(bricks.removed)
         self._news_at = time.monotonic()
 
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""
-        self._dirty["map"] |= self.store.put(colors.bricks, colors=colors.colors)
+        self.layers["map"].changed |= self.store.put(colors.bricks, colors=colors.colors)
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:
@@ -133,7 +131,11 @@ class MapScene:
         """Seconds until :meth:`flush` has something to do if no update comes; None if it has nothing to
         do."""
         now = time.monotonic()
-        if self._all_dirty or any(self._dirty.values()) or (self.shows_surface and self.surface.is_stale):
+        if (
+            self._all_dirty
+            or any(layer.changed for layer in self.layers.values())
+            or (self.shows_surface and self.surface.is_stale)
+        ):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
         inexact = any(layer.inexact() for layer in self.layers.values())
         return max(0.0, self._news_at + REST_S - now) if inexact else None
@@ -158,12 +160,10 @@ class MapScene:
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
         self._surface_wanted = options.show == "surface"
-        map_changed = everything or bool(self._dirty["map"])
-        any_changed = map_changed or bool(self._dirty["baseline"])
-        for name, layer in self.layers.items():
-            chunks = layer.all_chunks() if everything else self._dirty[name]
-            layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
-            self._dirty[name] = set()
+        map_changed = everything or bool(self.layers["map"].changed)
+        any_changed = map_changed or bool(self.layers["baseline"].changed)
+        for layer in self.layers.values():
+            layer.prepare(look, everything, exactly=rested)
         if everything:
             self.surface.outdate()
         if self.shows_surface:

@@ -163,6 +163,8 @@ class VoxelLayer:
     def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
         self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
         self.store, self.dynamic = VoxelStore(), VoxelStore()
+        self.changed: set[ChunkKey] = set()
+        """Chunks whose stores have changed since the last :meth:`prepare`."""
         self.origin_m = np.zeros(3)
         self.bytes_sent = 0
         self._sent: dict[ChunkKey, _Sent] = {}
@@ -185,11 +187,13 @@ class VoxelLayer:
         for key, node in self._nodes.items():
             node.position = self._position(key)
 
-    def prepare(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
-        """Find out what must be sent of some chunks; :meth:`send` sends it. Unless ``exactly``, small changes
-        of colour are left for later."""
-        for key in sorted(chunks):
+    def prepare(self, look: Look, everything: bool, exactly: bool) -> None:
+        """Find out what must be sent of chunks that have changed, or of ``everything``; :meth:`send` sends
+        it. Unless ``exactly``, small changes of colour are left for later."""
+        chunks = set(self.store.chunks) | set(self._sent) if everything else self.changed
+        for key in sorted(chunks | (self.inexact() if exactly else set())):
             self._prepare_chunk(key, look, exactly)
+        self.changed = set()
 
     def send(self) -> None:
         """Send what was prepared."""
@@ -203,10 +207,6 @@ class VoxelLayer:
     def inexact(self) -> set[ChunkKey]:
         """Chunks with small changes of colour that were left for later."""
         return {key for key, sent in self._sent.items() if not sent.exact}
-
-    def all_chunks(self) -> set[ChunkKey]:
-        """Every chunk that is in the store or in the scene."""
-        return set(self.store.chunks) | set(self._sent)
 
     def clear(self) -> None:
         """Remove everything from the scene and from the store."""

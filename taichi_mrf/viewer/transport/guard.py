@@ -169,7 +169,7 @@ def value_to_set(widget: Widget, sent: Any) -> Any | None:
         case viser.GuiTextHandle():
             return sent[:LONGEST_TEXT] if isinstance(sent, str) else None
         case viser.GuiSliderHandle():
-            return _slider_value(widget, sent) if _is_number(sent) else None
+            return _on_grid(sent, widget.min, widget, widget.value) if _is_number(sent) else None
         case viser.GuiNumberHandle():
             return _field_value(widget, sent, (widget.min, widget.max), widget.value)
         case viser.GuiMultiSliderHandle():
@@ -226,10 +226,6 @@ def _on_grid(value: float, origin: float, widget: Any, current: float) -> float:
         stepped = origin + round((value - origin) / widget.step) * widget.step
         value = _clamp(round(stepped, widget.precision), (widget.min, widget.max))
     return type(current)(value)
-
-
-def _slider_value(widget: viser.GuiSliderHandle, sent: Any) -> float:
-    return _on_grid(sent, widget.min, widget, widget.value)
 
 
 def _multi_slider_value(widget: viser.GuiMultiSliderHandle, sent: Any) -> tuple[float, ...] | None:

@@ -13,7 +13,7 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_page import BasePage
-from taichi_mrf.viewer.transport.inbox import Inbox
+from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.panel import KnobMoved, TunePanel
 

@@ -4,10 +4,10 @@ what they do.
 A slider has steps and the configuration has not: only the widget that a user has moved changes its parameter.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,10 +16,9 @@ import viser
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, in_html, in_markdown
-from taichi_mrf.viewer.transport.inbox import Event
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
@@ -324,10 +323,7 @@ def changes(first: Config, config: Config) -> str:
 
 
 def _short(config: Config, name: str) -> str:
-    value: object = dataclasses.asdict(config)
-    for field in name.split("."):
-        assert isinstance(value, dict)
-        value = value[field]
+    value = attrgetter(name)(config)
     if isinstance(value, tuple):
         return "(" + ", ".join(f"{term:.4g}" for term in value) + ")"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
