@@ -23,8 +23,14 @@ from taichi_mrf.viewer.scene.coloring import (
     scale_of,
     voxel_colors,
 )
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, border, placement
-from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import (
+    FRUSTUM_M,
+    RING_M,
+    border,
+    first_pixel,
+    first_voxel,
+    placement,
+)
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing

@@ -15,9 +15,8 @@ from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.answer import SWITCHES
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import COMMANDS, Dragged
+from taichi_mrf.viewer.live.panel import COMMANDS, SWITCHES, Dragged
 from taichi_mrf.viewer.scene.base_panel import Joined
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.transport import downloads

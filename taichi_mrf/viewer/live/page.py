@@ -10,19 +10,23 @@ import viser.transforms as vtf
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.answer import SWITCHES, Point, VoxelAnswer, beside, facts_of
 from taichi_mrf.viewer.live.panel import (
     CHOSEN_KEYFRAME,
     POSITION_STEP_M,
     SPEEDS,
+    SWITCHES,
     Clicked,
     Dragged,
     Panel,
+    Point,
+    VoxelAnswer,
+    beside,
+    facts_of,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import in_markdown
 
@@ -47,7 +51,6 @@ class Page(BasePage[Panel]):
         self._edits: list[tuple[Edit, Edit]] = []
         """Edits that can be taken back and made again: what undoes each, and itself."""
         self._done = 0  # how many of them are made
-        self._to_freeze: dict[int, int] = {}  # the keyframe that each client is asked about
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
@@ -76,7 +79,7 @@ class Page(BasePage[Panel]):
             "Fit": partial(self._look_from, "here"),
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
-            "Delete the map and start again": self._reset_confirmed,
+            "Delete the map and start again": self.panel.agree,
             "Undo": lambda client: self._undo(),
             "Redo": lambda client: self._redo(),
             "Keep the map": self.panel.close_question,
@@ -84,7 +87,7 @@ class Page(BasePage[Panel]):
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
             "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
             "Freeze": self._freeze,
-            "Freeze it": self._freeze_confirmed,
+            "Freeze it": self.panel.agree,
             "Move": lambda client: self._toggle_gizmo(),
             "Put back": lambda client: self._edit(self._move_home),
             "Position (m)": lambda client: self._edit(self._move_as_typed),
@@ -188,17 +191,13 @@ class Page(BasePage[Panel]):
                 "first frame. To keep the map, save it first.",
                 "Delete the map and start again",
                 "Keep the map",
+                lambda: self.ask(m.Reset()),
             )
-
-    def _reset_confirmed(self, client: int) -> None:
-        self.panel.close_question(client)
-        self.ask(m.Reset())
 
     def _freeze(self, client: int) -> None:
         """Ask before the chosen keyframe is frozen."""
         handle, chosen = self.server.get_clients().get(client), self._changeable()
         if handle is not None and chosen is not None:
-            self._to_freeze[client] = chosen.id
             self.panel.ask(
                 handle,
                 "Freeze the keyframe?",
@@ -206,13 +205,8 @@ class Page(BasePage[Panel]):
                 "drops its image: it can never be switched off, moved or looked at again.",
                 "Freeze it",
                 "Leave it as it is",
+                lambda: self.ask(m.Freeze(chosen.id)) if chosen.id in self.keyframes.keyframes else None,
             )
-
-    def _freeze_confirmed(self, client: int) -> None:
-        self.panel.close_question(client)
-        keyframe = self._to_freeze.pop(client, None)
-        if keyframe in self.keyframes.keyframes:
-            self.ask(m.Freeze(keyframe))
 
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)

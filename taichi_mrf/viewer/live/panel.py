@@ -1,26 +1,33 @@
-"""The widgets of the live page, with the folder "Time" of a map whose world may change. The page decides what
-they do.
+"""The widgets of the live page, with the folder "Time" of a map whose world may change, and the answer to a
+click on a voxel in a panel beside it. The page decides what they do.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from taichi_mrf.viewer.messages import (
-    Hello,
-    Images,
-    KeyframeInfo,
-    SceneChange,
-    SceneChanges,
-    Status,
-    TimeSpan,
-)
+from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
+
+Point = tuple[float, float, float]
+Vote = tuple[m.KeyframeInfo, float]
+"""A keyframe, and the log-odds that it adds to a voxel."""
+
+SWITCHES = tuple(f"switch off {place}" for place in range(5))
+"""Actions of the buttons beside what keyframes say of a voxel, by their places in the list."""
+
+_ASIDE_PX, _WIDTH_PX, _HEIGHT_PX = 65, 290, 430
+"""Size of the panel with all buttons, and its distance from the voxel."""
+
+_LINE_COLOR = (255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,7 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
-        self._questions: dict[int, Any] = {}
+        self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
         self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
@@ -118,7 +125,7 @@ class Panel(BasePanel):
             self.add_notices()
             self._parameters = gui.add_html("")
 
-    def show_hello(self, hello: Hello) -> None:
+    def show_hello(self, hello: m.Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
@@ -157,7 +164,7 @@ class Panel(BasePanel):
         if widget.value == ViewOptions().color_by:
             widget.value = "photo"
 
-    def show_status(self, status: Status) -> None:
+    def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         self.show_activity(status.activity, status.share, not (status.paused or status.finished))
         self._show_speed(status.speed)
@@ -190,7 +197,7 @@ class Panel(BasePanel):
         if self.speed.value != name:
             self.speed.value = name
 
-    def show_keyframes(self, keyframes: dict[int, KeyframeInfo], chosen: int | None) -> None:
+    def show_keyframes(self, keyframes: dict[int, m.KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
@@ -216,7 +223,7 @@ class Panel(BasePanel):
         """The keyframe that is selected in the dropdown."""
         return self._names.get(self.keyframe.value)
 
-    def show_images(self, images: Images) -> None:
+    def show_images(self, images: m.Images) -> None:
         """Show the images of one view."""
         self._measured.image, self._rendered.image = images.measured, images.rendered
         self._accuracy.image = images.accuracy
@@ -230,10 +237,14 @@ class Panel(BasePanel):
             picture.visible = False
         self._score.content = ""
 
-    def ask(self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str) -> None:
-        """Ask one user to confirm what cannot be undone: the action ``yes`` does it."""
+    def ask(
+        self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str, then: Callable[[], None]
+    ) -> None:
+        """Ask one user to confirm what cannot be undone, which ``then`` does. The answers are actions, for
+        :meth:`agree` and :meth:`close_question`."""
         self.close_question(client.client_id)
-        modal = self._questions[client.client_id] = client.gui.add_modal(title)
+        modal = client.gui.add_modal(title)
+        self._questions[client.client_id] = modal, then
         with modal:
             client.gui.add_markdown(text)
             client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, yes))
@@ -241,9 +252,15 @@ class Panel(BasePanel):
 
     def close_question(self, client: int) -> None:
         """Close the question."""
-        modal = self._questions.pop(client, None)
+        modal, _ = self._questions.pop(client, (None, None))
         if modal is not None and not modal.closed:
             modal.close()
+
+    def agree(self, client: int) -> None:
+        """Close the question, and do what was asked."""
+        _, then = self._questions.get(client, (None, lambda: None))
+        self.close_question(client)
+        then()
 
     def _keyframe_tab(self) -> None:
         gui = self.gui
@@ -282,7 +299,7 @@ class Panel(BasePanel):
         self._accuracy = gui.add_image(black, label=label, visible=False)
 
 
-def _colors_of(hello: Hello) -> tuple[ColorBy, ...]:
+def _colors_of(hello: m.Hello) -> tuple[ColorBy, ...]:
     """Choices of what the colour shows of a map."""
     found = list(OF_BELIEFS)
     if hello.counts_keyframes:
@@ -296,8 +313,8 @@ class TimeFolder:
     """Adds the folder at the place where the GUI stands. Times on the page count from the first keyframe."""
 
     def __init__(self, gui: viser.GuiApi, panel: BasePanel) -> None:
-        self._span: TimeSpan | None = None
-        self._latest: tuple[SceneChange, ...] = ()
+        self._span: m.TimeSpan | None = None
+        self._latest: tuple[m.SceneChange, ...] = ()
         self.folder = gui.add_folder("Time", visible=False)
         with self.folder:
             hint = (
@@ -324,7 +341,7 @@ class TimeFolder:
             return None
         return max(self._span.first_s, self._span.start_s + float(self.slider.value))
 
-    def show_span(self, span: TimeSpan) -> None:
+    def show_span(self, span: m.TimeSpan) -> None:
         """Set the slider's ends, and the time that is shown."""
         known, self._span = self._span is not None, span
         last_s = max(_on_grid(span.now_s - span.start_s), TIME_STEP_S)
@@ -337,7 +354,7 @@ class TimeFolder:
         if not known:
             self._show_list()
 
-    def show_changes(self, changes: SceneChanges) -> None:
+    def show_changes(self, changes: m.SceneChanges) -> None:
         """List what has appeared and left, the latest first."""
         self._latest = changes.changes
         self._show_list()
@@ -351,7 +368,7 @@ class TimeFolder:
         self._list.content = f'<div style="padding:0 0.75em;font-size:0.8em">{items}</div>'
 
 
-def _in_words(change: SceneChange, start_s: float) -> str:
+def _in_words(change: m.SceneChange, start_s: float) -> str:
     size = " x ".join(f"{side:.1f}" for side in change.size_m)
     centre = ", ".join(f"{value:.1f}" for value in change.centre_m)
     return f"{change.stamp_s - start_s:.1f} s: something of {size} m {change.verb} at ({centre})"
@@ -359,3 +376,89 @@ def _in_words(change: SceneChange, start_s: float) -> str:
 
 def _on_grid(seconds: float) -> float:
     return round(round(seconds / TIME_STEP_S) * TIME_STEP_S, 6)
+
+
+class VoxelAnswer:
+    """Owns a floating panel, and the scene nodes /answer, a label at the voxel, and /distance."""
+
+    def __init__(self, scene: viser.SceneApi, panel: BasePanel) -> None:
+        self._scene = scene
+        self.point: Point | None = None
+        """The voxel that is shown, in metres, world; None without one."""
+        self._apart: dict[str, str] = {}
+        self._panel = panel.gui.add_panel(visible=False)
+        with self._panel.add_tab("Voxel", viser.Icon.CUBE):
+            self._text = panel.gui.add_html("")
+            hint = "Remove this keyframe from the map."
+            self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
+            panel.add_button("Close", color="gray")
+        self.said_by: list[int] = []
+        """The keyframes that are listed."""
+
+    def move(self, point: Point, place: tuple[float, float]) -> None:
+        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and draw a line from the voxel
+        before."""
+        before, self.point = self.point, point
+        self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
+        self._panel.visible = True
+        if before is not None and before != point:
+            ends = np.array([before, point])
+            self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
+            self._scene.add_line_segments(
+                "/distance",
+                ends[None].astype(np.float32),
+                _LINE_COLOR,
+                thickness=2.0,
+                thickness_units="screen",
+            )
+
+    def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
+        """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest
+        first, each with a button; ``known`` is None before they have been asked."""
+        self._scene.add_label("/answer", facts["state"], position=np.array(self.point))
+        text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
+        if known:
+            seen_by = f"{len(votes)} keyframes see it" if len(votes) > 1 else "one keyframe sees it"
+            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees it"
+        self._text.content = (
+            f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
+        )
+        self.said_by = [keyframe.id for keyframe, _ in votes[: len(SWITCHES)]]
+        for i, button in enumerate(self._switches):
+            button.visible = i < len(self.said_by)
+            if button.visible:
+                button.label = f"Switch off {votes[i][0].name}: {in_words(votes[i][1])}"
+
+    def clear(self) -> None:
+        """Hide the answer, and remove the line from the scene."""
+        self.point, self._apart, self.said_by, self._panel.visible = None, {}, [], False
+        for name in ("/answer", "/distance"):
+            self._scene.remove_by_name(name)
+
+
+def beside(x: float, y: float, width: int, height: int) -> tuple[float, float]:
+    """The panel's upper left corner, in pixels: beside a click at (x, y) in a window of this size, towards
+    its middle, as far as it fits in."""
+    left = x + _ASIDE_PX if x < 0.45 * width else x - _ASIDE_PX - _WIDTH_PX
+    return max(left, 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
+
+
+def in_words(log_odds: float) -> str:
+    """What a keyframe alone would say of a voxel."""
+    sure = 1 / (1 + np.exp(-abs(log_odds)))
+    return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
+
+
+def facts_of(point: NDArray[np.float64], store: VoxelStore, hello: m.Hello) -> dict[str, str]:
+    """Coordinates, state, probability and colour of the voxel at a point (3,) in metres, as shown."""
+    facts = {"x, y, z (m)": ", ".join(f"{value:.2f}" for value in point)}
+    found = store.voxel(np.floor(point / hello.voxel_size).astype(np.int64))
+    if found is None:
+        return facts | {"state": "unknown"}
+    log_odds = found[0] * m.LOG_ODDS_STEP
+    known = abs(log_odds - hello.prior_log_odds) >= hello.min_evidence
+    facts["state"] = "unknown" if not known else "occupied" if log_odds >= 0 else "free"
+    facts["probability"] = f"{1 / (1 + np.exp(-log_odds)):.3f}"
+    if found[1] is not None:
+        facts["colour (RGB)"] = ", ".join(str(part) for part in found[1].tolist())
+    return facts

@@ -76,12 +76,8 @@ class MapScene:
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
-        corners = []
-        for layer in self.layers.values():
-            bounds = layer.store.bounds()
-            if bounds is not None:
-                ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
-                corners.append(ends + layer.origin_m)
+        ends = ((layer.ends_m(), layer.origin_m) for layer in self.layers.values())
+        corners = [end + origin_m for end, origin_m in ends if end is not None]
         if not corners:
             return None
         every = np.concatenate(corners)
@@ -228,10 +224,9 @@ class MapScene:
             if not two:
                 self._server.scene.remove_by_name(f"/names/{layer}")
                 continue
-            bounds = self.layers[layer].store.bounds()
-            if bounds is None:
+            ends = self.layers[layer].ends_m()
+            if ends is None:
                 continue
-            ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
             above = ends.mean(axis=0) + self.layers[layer].origin_m
             axis, sign = up
             above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()
@@ -240,10 +235,10 @@ class MapScene:
     def _baseline_m(self, up: Up) -> NDArray[np.float64]:
         """The shift of the baseline's map, in metres: past the map, along a horizontal axis."""
         shift = np.zeros(3)
-        bounds = self.store.bounds()
-        if bounds is not None:
+        ends = self.layers["map"].ends_m()
+        if ends is not None:
             axis = 0 if up[0] != 0 else 1
-            shift[axis] = (bounds[1] - bounds[0] + 1)[axis] * BRICK * self._hello.voxel_size + _GAP_M
+            shift[axis] = ends[1, axis] - ends[0, axis] + _GAP_M
         return shift
 
 

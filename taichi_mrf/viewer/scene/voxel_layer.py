@@ -181,6 +181,11 @@ class VoxelLayer:
         """How many of them have the colour of dynamic voxels."""
         return sum(each.dynamic for each in self._ahead())
 
+    def ends_m(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner (2, 3) in metres from the origin of the layer; None if it is empty."""
+        bounds = self.store.bounds()
+        return None if bounds is None else np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._voxel_size
+
     def place(self, origin_m: NDArray[np.float64]) -> None:
         """Move the whole layer to another origin, (3,) in metres, world."""
         self.origin_m = origin_m

@@ -10,36 +10,25 @@ from dataclasses import fields
 from typing import Any
 
 import msgspec
-from viser._messages import (
-    CommandTriggerMessage,
-    GetRenderResponseMessage,
-    GuiUpdateMessage,
-    Message,
-    SceneNodeClickMessage,
-    ScenePointerMessage,
-    TransformControlsDragEndMessage,
-    TransformControlsDragStartMessage,
-    TransformControlsUpdateMessage,
-    ViewerCameraMessage,
-)
+from viser import _messages as theirs
 
-_FIELDS: dict[type[Message], tuple[str, ...]] = {
+_FIELDS: dict[type[theirs.Message], tuple[str, ...]] = {
     kind: tuple(field.name for field in fields(kind) if field.name != "excluded_self_client")
     for kind in (
-        CommandTriggerMessage,
-        GetRenderResponseMessage,
-        GuiUpdateMessage,
-        SceneNodeClickMessage,
-        ScenePointerMessage,
-        TransformControlsDragEndMessage,
-        TransformControlsDragStartMessage,
-        TransformControlsUpdateMessage,
-        ViewerCameraMessage,
+        theirs.CommandTriggerMessage,
+        theirs.GetRenderResponseMessage,
+        theirs.GuiUpdateMessage,
+        theirs.SceneNodeClickMessage,
+        theirs.ScenePointerMessage,
+        theirs.TransformControlsDragEndMessage,
+        theirs.TransformControlsDragStartMessage,
+        theirs.TransformControlsUpdateMessage,
+        theirs.ViewerCameraMessage,
     )
 }
 """The fields of each kind that a client may set."""
 
-_KINDS: dict[Any, type[Message]] = {kind.__name__: kind for kind in _FIELDS}
+_KINDS: dict[Any, type[theirs.Message]] = {kind.__name__: kind for kind in _FIELDS}
 
 LARGEST_COORDINATE = 1e9
 """Metres; far beyond any map, and its square is still a finite float32."""
@@ -52,7 +41,7 @@ class Undecodable(Exception):  # noqa: N818 - a finding about bytes, not a failu
     """The bytes are no message, so the client is not a viewer's page."""
 
 
-def decode(encoded: bytes) -> Message | None:
+def decode(encoded: bytes) -> theirs.Message | None:
     """The message in these bytes; None if clients may not send it.
 
     Raises :class:`Undecodable` if the bytes are no msgpack.
@@ -75,7 +64,7 @@ def decode(encoded: bytes) -> Message | None:
         return None
 
 
-def encode(message: Message) -> bytes:
+def encode(message: theirs.Message) -> bytes:
     """The message as viser reads it."""
     kind = type(message)
     return msgspec.msgpack.encode(

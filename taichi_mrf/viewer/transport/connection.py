@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from viser._messages import GetRenderResponseMessage, GuiUpdateMessage, Message, ViewerCameraMessage
+from viser import _messages as theirs
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode
 from websockets.protocol import State
@@ -68,7 +68,7 @@ class GuardedConnection(ServerConnection):
         super().__init__(*args, **options)
         self._budget = Budget(MESSAGES_PER_SECOND, MESSAGES_PER_SECOND, monotonic())
         self._reading: asyncio.Task[str | bytes] | None = None
-        self._held: dict[str, tuple[float, Message]] = {}
+        self._held: dict[str, tuple[float, theirs.Message]] = {}
         """Messages that are admitted later unless others replace them, with the time when they are due."""
         self._camera_due = 0.0
         self._picture_bytes = 0
@@ -116,13 +116,13 @@ class GuardedConnection(ServerConnection):
         self._picture_bytes = 0
         return len(self.protocol.reader.buffer) + (self.protocol.current_size or 0) <= LARGEST_MESSAGE
 
-    def _due_message(self) -> Message | None:
+    def _due_message(self) -> theirs.Message | None:
         """A message that was held back and whose time has come."""
         now = monotonic()
         for key, (due, message) in self._held.items():
             if due <= now:
                 del self._held[key]
-                if isinstance(message, ViewerCameraMessage):
+                if isinstance(message, theirs.ViewerCameraMessage):
                     self._camera_due = now + CAMERA_INTERVAL_S
                 return message
         return None
@@ -130,9 +130,8 @@ class GuardedConnection(ServerConnection):
     def _typed_is_complete(self) -> bool:
         """Release what is being typed, because the user now uses another widget; returns whether there was
         anything."""
-        typed = [key for key, (_, message) in self._held.items() if isinstance(message, GuiUpdateMessage)]
-        for key in typed:
-            self._held[key] = monotonic(), self._held[key][1]
+        typed = {key: message for key, (_, message) in self._held.items() if key != "camera"}
+        self._held |= {key: (monotonic(), message) for key, message in typed.items()}
         return bool(typed)
 
     def _patience_s(self) -> float | None:
@@ -155,7 +154,7 @@ class GuardedConnection(ServerConnection):
         reading, self._reading = self._reading, None
         return reading.result()
 
-    async def _understand(self, received: str | bytes) -> Message | None:
+    async def _understand(self, received: str | bytes) -> theirs.Message | None:
         """The message, unless it is refused or held back. Closes the connection if viser's client cannot
         have sent it."""
         if isinstance(received, str):
@@ -173,15 +172,15 @@ class GuardedConnection(ServerConnection):
         except Undecodable:
             await self.close(CloseCode.INVALID_DATA)
             return None
-        if message is None or (is_large and not isinstance(message, GetRenderResponseMessage)):
+        if message is None or (is_large and not isinstance(message, theirs.GetRenderResponseMessage)):
             return None
-        if isinstance(message, ViewerCameraMessage):  # costs nothing: never more than one of them waits
+        if isinstance(message, theirs.ViewerCameraMessage):  # costs nothing: only one of them waits
             if self.gate.admit(client_id, message) is not None:
                 self._held["camera"] = self._camera_due, message
             return None
         if not self._budget.spend(monotonic()):
             return None
-        if isinstance(message, GuiUpdateMessage):
+        if isinstance(message, theirs.GuiUpdateMessage):
             self._held.pop(message.uuid, None)
             if self.gate.may_be_unfinished(client_id, message):
                 self._held[message.uuid] = monotonic() + TYPING_REST_S, message

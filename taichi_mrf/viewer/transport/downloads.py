@@ -65,8 +65,11 @@ class Downloads:
         """Give a browser the scene as one HTML file."""
         if self._begin(client, "page"):
             scene = self._server.get_scene_serializer()
-            self._later(
-                client, "page", lambda: self.send(client, "map.html", standalone_page(scene, dark).encode())
+            self._pool.submit(
+                self._finish,
+                client,
+                "page",
+                lambda: self.send(client, "map.html", standalone_page(scene, dark).encode()),
             )
 
     def toggle_recording(self, client: int) -> None:

@@ -13,18 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import viser
-from viser._messages import (
-    CommandTriggerMessage,
-    GetRenderResponseMessage,
-    GuiUpdateMessage,
-    Message,
-    SceneNodeClickMessage,
-    ScenePointerMessage,
-    TransformControlsDragEndMessage,
-    TransformControlsDragStartMessage,
-    TransformControlsUpdateMessage,
-    ViewerCameraMessage,
-)
+from viser import _messages as theirs
 from viser.infra import ClientId
 from websockets.asyncio.server import ServerConnection
 
@@ -61,34 +50,36 @@ class Gate:
         """True if a picture was asked of this client and has not arrived."""
         return internals.awaits_picture(self._server, client_id)
 
-    def may_be_unfinished(self, client_id: ClientId, message: GuiUpdateMessage) -> bool:
+    def may_be_unfinished(self, client_id: ClientId, message: theirs.GuiUpdateMessage) -> bool:
         """True if the message may be a number that is still being typed: one outside the range of its widget,
         as the 0 of 0.8 is, and any of a vector, each of whose values may move a keyframe."""
         widget = internals.input_widget(self._server, client_id, message.uuid)
         is_vector = isinstance(widget, viser.GuiVector2Handle | viser.GuiVector3Handle)
         return is_vector or (widget is not None and is_out_of_range(widget, message.updates.get("value")))
 
-    def admit(self, client_id: ClientId, message: Message) -> Message | None:
+    def admit(self, client_id: ClientId, message: theirs.Message) -> theirs.Message | None:
         """The message as viser may have it; None if viser must not have it."""
         match message:
-            case ViewerCameraMessage():
+            case theirs.ViewerCameraMessage():
                 return _tidy_camera(message)
-            case GuiUpdateMessage():
+            case theirs.GuiUpdateMessage():
                 return self._tidy_update(client_id, message)
-            case SceneNodeClickMessage():
+            case theirs.SceneNodeClickMessage():
                 scene = internals.scene_of(self._server, client_id, message.owner)
                 known = scene is not None and internals.node(scene, message.name) is not None
                 return _tidy_click(message) if known and (message.instance_index or 0) >= 0 else None
-            case ScenePointerMessage():
+            case theirs.ScenePointerMessage():
                 is_click = message.event_type == "click" and len(message.screen_pos) == 1
                 return _tidy_click(message) if is_click else None
-            case GetRenderResponseMessage():
+            case theirs.GetRenderResponseMessage():
                 return message if self.awaits_picture(client_id) else None
-            case CommandTriggerMessage():
+            case theirs.CommandTriggerMessage():
                 return message if internals.has_command(self._server, client_id, message.uuid) else None
         return self._tidy_gizmo(client_id, message)
 
-    def _tidy_update(self, client_id: ClientId, message: GuiUpdateMessage) -> GuiUpdateMessage | None:
+    def _tidy_update(
+        self, client_id: ClientId, message: theirs.GuiUpdateMessage
+    ) -> theirs.GuiUpdateMessage | None:
         """The update with a value that its widget can have. If that is not what the client sent, the client
         is told which value is in force. A client may write no other property of a widget."""
         widget = internals.input_widget(self._server, client_id, message.uuid)
@@ -101,24 +92,22 @@ class Gate:
         in_force = widget.value if value is None else value
         if not internals.is_button(widget) and not is_same(sent, in_force):
             internals.tell_value(self._server, client_id, message.uuid, in_force)
-        return None if value is None else GuiUpdateMessage(message.uuid, {"value": value})
+        return None if value is None else theirs.GuiUpdateMessage(message.uuid, {"value": value})
 
-    def _tidy_gizmo(self, client_id: ClientId, message: Any) -> Message | None:
+    def _tidy_gizmo(self, client_id: ClientId, message: Any) -> theirs.Message | None:
         """A gizmo that is shown may be used; one that is held may always be let go."""
         scene = internals.scene_of(self._server, client_id, message.owner)
         if scene is None:
             return None
-        if isinstance(message, TransformControlsDragEndMessage) and internals.holds_gizmo(
-            scene, client_id, message.name
-        ):
+        is_release = isinstance(message, theirs.TransformControlsDragEndMessage)
+        if is_release and internals.holds_gizmo(scene, client_id, message.name):
             return message
         gizmo = internals.node(scene, message.name)
         if not isinstance(gizmo, viser.TransformControlsHandle) or not gizmo.visible:
             return None
-        if isinstance(message, TransformControlsUpdateMessage):
+        if isinstance(message, theirs.TransformControlsUpdateMessage):
             wxyz = _unit(message.wxyz)
             return None if wxyz is None else replace(message, wxyz=wxyz)
-        assert isinstance(message, TransformControlsDragStartMessage | TransformControlsDragEndMessage)
         return message
 
 
@@ -128,25 +117,19 @@ def _unit(vector: tuple[float, ...] | None) -> Any:
     return None if vector is None or norm < SHORTEST_VECTOR else tuple(part / norm for part in vector)
 
 
-def _tidy_camera(message: ViewerCameraMessage) -> ViewerCameraMessage | None:
+def _tidy_camera(message: theirs.ViewerCameraMessage) -> theirs.ViewerCameraMessage | None:
     """A canvas that is folded away has no pixels; viser divides by their number."""
     wxyz, up_direction = _unit(message.wxyz), _unit(message.up_direction)
     sides = message.image_height, message.image_width
     is_possible = 0 < message.fov < math.pi and 0 < message.near < message.far
-    if (
-        wxyz is None
-        or up_direction is None
-        or not is_possible
-        or not 0 <= min(sides) <= max(sides) <= MOST_PIXELS
-    ):
+    is_possible &= 0 <= min(sides) <= max(sides) <= MOST_PIXELS
+    if wxyz is None or up_direction is None or not is_possible:
         return None
     height, width = (max(side, 1) for side in sides)
     return replace(message, wxyz=wxyz, up_direction=up_direction, image_height=height, image_width=width)
 
 
-def _tidy_click(
-    message: SceneNodeClickMessage | ScenePointerMessage,
-) -> SceneNodeClickMessage | ScenePointerMessage | None:
+def _tidy_click(message: theirs.SceneNodeClickMessage | theirs.ScenePointerMessage) -> theirs.Message | None:
     ray_direction = _unit(message.ray_direction)
     if ray_direction is None or message.ray_origin is None:
         return None
