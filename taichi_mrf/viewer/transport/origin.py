@@ -130,4 +130,4 @@ def _made_ours(page: bytes, nonce: str, packed: bool) -> bytes:
     plain = (gzip.decompress(page) if packed else page).decode()
     plain = plain.replace("<title>Viser</title>", TAB_TITLE + pulse.TAG, 1)
     ours = with_nonce(plain, nonce).encode()
-    return gzip.compress(ours, compresslevel=1) if packed else ours
+    return gzip.compress(ours) if packed else ours
