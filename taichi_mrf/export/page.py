@@ -25,7 +25,7 @@ from taichi_mrf.viewer.transport.downloads import standalone_page
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.voxels.cells import SUREST, lowest_voxels, standing_in, voxels_of_cells
 from taichi_mrf.voxels.colors import NO_COLOR
-from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS
 
 _NOT_SHOWN = np.float32(-60)
 """Log-odds below any threshold."""
@@ -51,16 +51,16 @@ def write_page(
         for bricks, log_odds, _ in reader.batches(reader.bricks):
             # Some maps give unseen voxels a probability of one half; those must not be shown.
             seen = np.where(log_odds == prior, _NOT_SHOWN, log_odds)
-            layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
+            layer.store.put(bricks, log_odds=pack_log_odds(seen))
             if colored is not None:
-                layer.store.paint(bricks, shown_colors_in(colored, reader.slots(bricks)))
+                layer.store.put(bricks, colors=shown_colors_in(colored, reader.slots(bricks)))
         eye = ViewpointController(server)
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
             options = ViewOptions(color_by=color_by, threshold=threshold)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
-            layer.prepare(layer.all_chunks(), look, exactly=True)
+            layer.prepare(look, everything=True, exactly=True)
             layer.send()
             if cells:
                 add_cells(server.scene, layer.store, look, m.voxel_size, prior + min_evidence)
@@ -101,17 +101,17 @@ def standing_cells(chunk: Chunk, threshold: float, evidence: float) -> list[tupl
     ``Shown.cells`` are their lowest voxels, the other values those of the cells. Voxels of more than
     ``evidence`` log-odds have evidence of a surface."""
     steps = int(np.floor(evidence / LOG_ODDS_STEP))
-    rows = np.flatnonzero((chunk.log_odds > steps).any(axis=1))
-    log_odds, corners = chunk.log_odds[rows], chunk.bricks[rows] * BRICK
+    rows = np.flatnonzero((chunk.values["log_odds"] > steps).any(axis=1))
+    log_odds, corners = chunk.values["log_odds"][rows], chunk.bricks[rows] * BRICK
     marginals = _marginals()[log_odds.view(np.uint16)]
     found = []
     for side, standing, likely in standing_in(marginals, log_odds > steps, 1 / (1 + math.exp(-threshold))):
         row, cell = np.nonzero(standing)
         p = np.minimum(likely[row, cell].astype(np.float64), SUREST)
         voxels = rows[row][:, None], voxels_of_cells(side)[cell]
-        colors = None if chunk.colors is None else _mean_colors(chunk.colors[voxels])
+        colors = _mean_colors(chunk.values["colors"][voxels]) if "colors" in chunk.values else None
         lowest = (corners[row] + lowest_voxels(side)[cell]).astype(np.uint8)
-        seen = chunk.seen[voxels].max(axis=1)
+        seen = chunk.values["seen"][voxels].max(axis=1)
         found.append((side, Shown(lowest, pack_log_odds(np.log(p / (1 - p))), seen, colors)))
     return found
 

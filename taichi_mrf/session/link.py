@@ -178,6 +178,6 @@ def _serve_page(connection: Connection, host: str, port: int) -> None:
     """Main function of the viewer's process. Imported late: mapping needs none of the page's libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from taichi_mrf.viewer.live.page import Page
-    from taichi_mrf.viewer.transport.process import run_viewer
+    from taichi_mrf.viewer.scene.base_page import run_viewer
 
     run_viewer(connection, host, port, Page)

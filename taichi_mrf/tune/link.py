@@ -56,7 +56,7 @@ class NoPage:
 def _serve_page(connection: Connection, host: str, port: int) -> None:
     """Main function of the page's process. Imported late: mapping needs none of its libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from taichi_mrf.viewer.transport.process import run_viewer
+    from taichi_mrf.viewer.scene.base_page import run_viewer
     from taichi_mrf.viewer.tune.page import TunePage
 
     run_viewer(connection, host, port, TunePage)

@@ -31,7 +31,7 @@ def store_of(log_odds: np.ndarray) -> VoxelStore:
     """One brick, by the log-odds of its voxels, (8, 8, 8)."""
     store = VoxelStore()
     packed = m.pack_log_odds(log_odds.reshape(1, 512).astype(np.float32))
-    store.put(BRICK, packed, np.full((1, 512), 3, np.uint8))
+    store.put(BRICK, log_odds=packed, seen=np.full((1, 512), 3, np.uint8))
     return store
 
 
@@ -88,5 +88,5 @@ def test_a_cell_has_the_mean_of_the_colours_that_were_seen_in_it() -> None:
     store = store_of(wall(8, -2.0))
     colors = np.full((1, 512, 3), 128, np.uint8)
     colors[0, :10], colors[0, 10:20] = (10, 20, 30), (30, 20, 50)
-    store.paint(BRICK, colors)
+    store.put(BRICK, colors=colors)
     assert set(boxes(store, color_by="photo").values()) == {(20, 20, 40)}

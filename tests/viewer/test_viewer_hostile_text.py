@@ -18,9 +18,9 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.scene.base_page import NewPage
 from taichi_mrf.viewer.scene.widgets import LONGEST, in_html, in_markdown
 from taichi_mrf.viewer.transport.downloads import standalone_page
-from taichi_mrf.viewer.transport.process import AnyPage
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.messages import Scores
@@ -107,7 +107,7 @@ def browser() -> Iterator["Browser"]:
 
 @contextmanager
 def served(
-    new_page: Callable[[viser.ViserServer, Callable[[m.Request], None]], AnyPage],
+    new_page: NewPage,
     updates: tuple[m.Update, ...],
 ) -> Iterator[tuple[viser.ViserServer, Callable[[], None]]]:
     """A page that runs, its server, and what sends it the updates."""

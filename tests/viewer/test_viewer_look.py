@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viser.transforms as vtf
 
 from taichi_mrf.geometry.poses import as_pose, look_at
 from taichi_mrf.geometry.up import up_of, up_vector
@@ -22,8 +23,14 @@ from taichi_mrf.viewer.scene.coloring import (
     scale_of,
     voxel_colors,
 )
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement, border
-from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import (
+    FRUSTUM_M,
+    RING_M,
+    border,
+    first_pixel,
+    first_voxel,
+    placement,
+)
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
@@ -86,9 +93,9 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     scale, store = scale_of("photo", 0.5, HEIGHTS), VoxelStore()
     bricks = np.array([[0, 0, 0], [0, 0, 1], [9, 0, 0]], np.int32)
     colors = np.random.default_rng(0).integers(0, 255, (3, 512, 3)).astype(np.uint8)
-    store.paint(bricks[:2], colors[:2])  # may come before the voxels, which are hidden until then
+    store.put(bricks[:2], colors=colors[:2])  # may come before the voxels, which are hidden until then
     assert not len(store.shown((0, 0, 0), 0.0, None).cells)
-    assert store.put(bricks, np.full((3, 512), 100, np.int16), np.ones((3, 512), np.uint8))
+    assert store.put(bricks, log_odds=np.full((3, 512), 100, np.int16), seen=np.ones((3, 512), np.uint8))
     seen = store.shown((0, 0, 0), 0.0, None)
     np.testing.assert_array_equal(voxel_colors(scale, seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
     unseen = store.shown((1, 0, 0), 0.0, None)
@@ -119,7 +126,7 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
-    large.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    large.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
     by_marginal, by_height = ViewOptions(color_by="marginal"), ViewOptions()
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
@@ -139,7 +146,7 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
 )
 def test_every_option_of_the_voxels_makes_another_look(changes: dict[str, Any]) -> None:
     store = VoxelStore()
-    store.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    store.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
     options = ViewOptions()
     before = look_of(options, store, (2, 1), 0.05)
     assert look_of(dataclasses.replace(options, **changes), store, (2, 1), 0.05) != before
@@ -157,9 +164,9 @@ def keyframe(id: int, T_world_camera: np.ndarray, camera: Camera = CAMERA) -> Ke
 
 def test_a_click_on_a_picture_finds_its_pixel() -> None:
     rng = np.random.default_rng(3)
-    place = Placement(rng.normal(size=4), rng.normal(size=3))
-    place = Placement(place.wxyz / np.linalg.norm(place.wxyz), place.position)
-    T = place.pose()
+    wxyz_xyz = rng.normal(size=7)
+    wxyz_xyz[:4] /= np.linalg.norm(wxyz_xyz[:4])
+    T = vtf.SE3(wxyz_xyz).as_matrix()
     u, v = 12.0, 40.0
     on_picture = FRUSTUM_M * np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0])
     point = T[:3, :3] @ on_picture + T[:3, 3]
@@ -169,7 +176,7 @@ def test_a_click_on_a_picture_finds_its_pixel() -> None:
     assert (hit.keyframe, round(hit.u, 6), round(hit.v, 6)) == (7, u, v)
     assert hit.range_m == pytest.approx(np.linalg.norm(point - eye))
     assert first_pixel(eye, eye - point, [keyframe(7, T)]) is None
-    np.testing.assert_allclose(Placement.of(T).pose(), T, atol=1e-12)
+    np.testing.assert_allclose(vtf.SE3(np.concatenate(placement(T))).as_matrix(), T, atol=1e-12)
 
 
 LIDAR = SphericalCamera(np.linspace(0.5, -0.5, 12), np.linspace(3.0, -3.0, 60))
@@ -269,7 +276,7 @@ def test_an_empty_ray_has_curves_too() -> None:
 def test_packed_steps_are_what_the_store_compares_with() -> None:
     store = VoxelStore()
     values = np.full((1, 512), round(0.4 / LOG_ODDS_STEP), np.int16)
-    store.put(np.zeros((1, 3), np.int32), values, np.zeros((1, 512), np.uint8))
+    store.put(np.zeros((1, 3), np.int32), log_odds=values)
     p = 1 / (1 + math.exp(-0.39))
     assert len(store.shown((0, 0, 0), math.log(p / (1 - p)), None).cells) == 512
     assert len(store.shown((0, 0, 0), 0.41, None).cells) == 0

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import viser
 from handled_page import HandledPage
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
 
@@ -15,10 +16,10 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import Action, Dragged
+from taichi_mrf.viewer.live.panel import COMMANDS, SWITCHES, Dragged
+from taichi_mrf.viewer.scene.base_panel import Joined
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.transport import downloads
-from taichi_mrf.viewer.transport.process import Joined
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
@@ -37,7 +38,7 @@ class LivePage(HandledPage):
     def __init__(self) -> None:
         super().__init__(Page, HELLO, keyframe(0), keyframe(1, 1.0))
 
-    def act(self, action: Action, client: int = 0) -> None:
+    def act(self, action: str, client: int = 0) -> None:
         self.page.actions[action](client)
 
     def client_id(self) -> int:
@@ -60,6 +61,17 @@ def browser(handled: LivePage) -> Iterator[RawClient]:
         yield client
 
 
+def test_each_button_has_an_action(handled: LivePage) -> None:
+    page = handled.page
+    widgets = page.server.gui._gui_input_handle_from_uuid.values()
+    names = {each.label for each in widgets if isinstance(each, viser.GuiButtonHandle)} - {""}
+    names |= {
+        name for each in widgets if isinstance(each, viser.GuiButtonGroupHandle) for name in each.options
+    }
+    assert {"Play", "Freeze", "Close", "Show the ray"} <= names
+    assert names | {action for action, *_ in COMMANDS.values()} | {*SWITCHES} <= page.actions.keys()
+
+
 def gizmo_x(handled: LivePage) -> float:
     gizmo = handled.page.keyframes.gizmo
     assert gizmo is not None
@@ -67,7 +79,7 @@ def gizmo_x(handled: LivePage) -> float:
 
 
 def test_the_gizmo_goes_where_its_keyframe_is_put(handled: LivePage) -> None:
-    handled.act(Action.TOGGLE_GIZMO)
+    handled.act("Move")
     assert gizmo_x(handled) == 0.0
     handled.take(keyframe(0, 3.0))
     assert gizmo_x(handled) == 3.0
@@ -76,7 +88,7 @@ def test_the_gizmo_goes_where_its_keyframe_is_put(handled: LivePage) -> None:
 
 
 def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: LivePage) -> None:
-    handled.act(Action.TOGGLE_GIZMO)
+    handled.act("Move")
     handled.take(Dragged(True), keyframe(0, 3.0))
     assert gizmo_x(handled) == 0.0
     handled.take(Dragged(False), keyframe(0, 4.0))
@@ -86,21 +98,21 @@ def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: LivePage) -> None:
 
 def test_a_frozen_keyframe_cannot_be_changed(handled: LivePage) -> None:
     page = handled.page
-    handled.act(Action.TOGGLE_GIZMO)
+    handled.act("Move")
     handled.take(keyframe(0, state="frozen"))
     assert page.keyframes.gizmo is None
     widgets = (page.panel.position, page.panel.pixel)
     assert [widget.disabled for widget in widgets] == [True, True]
     edits = (
-        Action.SWITCH, Action.FREEZE, Action.TOGGLE_GIZMO, Action.PUT_BACK, Action.SET_POSITION,
-        Action.SHOW_PIXEL_RAY,
+        "On/off", "Freeze", "Move", "Put back", "Position (m)",
+        "Show the ray",
     )  # fmt: skip
     for action in edits:  # a press may have been on its way
         handled.act(action)
     assert handled.asked == []
     handled.take(keyframe(0, state="on"))
     assert [widget.disabled for widget in widgets] == [False, False]
-    handled.act(Action.SWITCH)
+    handled.act("On/off")
     assert handled.asked == [m.Switch(0, on=False)]
 
 
@@ -116,7 +128,7 @@ def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: LivePage) -> Non
     handled.take(replace(HELLO, has_frames=False))
     assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
-    assert not panel._options.handles["follow"].visible
+    assert not panel.view_options.handles["follow"].visible
 
 
 def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> None:
@@ -128,7 +140,7 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
 
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
-    colors = handled.page.panel._options.handles["color_by"]
+    colors = handled.page.panel.view_options.handles["color_by"]
     assert list(colors.options) == ["marginal", "height", "uncertainty", "keyframes"]
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
     assert list(colors.options) == ["marginal", "height", "uncertainty", "photo"]
@@ -136,39 +148,39 @@ def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: Live
 
 def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClient) -> None:
     client = handled.client_id()
-    handled.act(Action.RESET, client)
+    handled.act("Reset", client)
     question = browser.hear_type("GuiModalMessage")["uuid"]
     browser.hear_type("GuiButtonMessage", container_uuid=question)
-    handled.act(Action.RESET, client)
+    handled.act("Reset", client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     question = browser.hear_type("GuiModalMessage")["uuid"]
     assert handled.asked == []
-    handled.act(Action.CANCELLED, client)
+    handled.act("Keep the map", client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     assert handled.asked == []
-    handled.act(Action.RESET, client)
-    handled.act(Action.RESET_CONFIRMED, client)
+    handled.act("Reset", client)
+    handled.act("Delete the map and start again", client)
     assert handled.asked == [m.Reset()]
 
 
 def test_freeze_asks_before_it_acts(handled: LivePage, browser: RawClient) -> None:
     client = handled.client_id()
-    handled.act(Action.FREEZE, client)
+    handled.act("Freeze", client)
     question = browser.hear_type("GuiModalMessage")["uuid"]
-    handled.act(Action.CANCELLED, client)
+    handled.act("Keep the map", client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
-    handled.act(Action.FREEZE_CONFIRMED, client + 1)  # of one that was not asked
+    handled.act("Freeze it", client + 1)  # of one that was not asked
     assert handled.asked == []
-    handled.act(Action.FREEZE, client)
+    handled.act("Freeze", client)
     handled.take(keyframe(1))
     handled.page._choose(1)  # another browser chooses another one meanwhile
-    handled.act(Action.FREEZE_CONFIRMED, client)
+    handled.act("Freeze it", client)
     assert handled.asked == [m.Freeze(0)]
 
 
 def test_an_empty_map_is_reset_at_once(handled: LivePage, browser: RawClient) -> None:
     handled.take(HELLO)
-    handled.act(Action.RESET, handled.client_id())
+    handled.act("Reset", handled.client_id())
     assert handled.asked == [m.Reset()]
 
 
@@ -182,14 +194,14 @@ def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:
 def test_a_ray_fills_in_its_pixel(handled: LivePage) -> None:
     handled.take(answer(0, (3, 4)))
     assert handled.page.panel.pixel.value == (3.0, 4.0)
-    handled.act(Action.SHOW_PIXEL_RAY)
+    handled.act("Show the ray")
     assert handled.asked == [m.PixelRay(0, 3.0, 4.0)]
     handled.take(answer(None, None), answer(77, (1, 1)))
     assert handled.page.panel.pixel.value == (3.0, 4.0)
 
 
 def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage) -> None:
-    handled.act(Action.TOGGLE_GIZMO)
+    handled.act("Move")
     handled.take(answer(1, (3, 4)))
     assert handled.page.keyframes.chosen == 0
     assert handled.page.keyframes.gizmo is not None
@@ -197,8 +209,8 @@ def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage)
 
 
 def follow(handled: LivePage, on: bool = True) -> None:
-    handled.page.panel._options.handles["follow"].value = on
-    before, handled.page.options = handled.page.options, handled.page.panel.options()
+    handled.page.panel.view_options.handles["follow"].value = on
+    before, handled.page.options = handled.page.options, handled.page.panel.view_options.value()
     handled.page.options_changed(before)
 
 
@@ -239,17 +251,17 @@ def test_a_browser_that_sends_no_picture_keeps_nobody_waiting(
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
     silent = handled.client_id()
     for _ in range(6):
-        handled.act(Action.SAVE_PICTURE, silent)
+        handled.act("Picture", silent)
     browser.hear_type("GetRenderRequestMessage")
     with raw_client(handled.server.get_port()) as other:
         other.say(camera_message(image_width=40, image_height=30))
         wait_for(lambda: len(handled.server.get_clients()) == 2, "the other client")
-        handled.act(Action.SAVE_PICTURE, max(handled.server.get_clients()))
+        handled.act("Picture", max(handled.server.get_clients()))
         request = other.hear_type("GetRenderRequestMessage")
         picture = {"type": "GetRenderResponseMessage", "payload": png(30, 40)}
         other.say({**picture, "render_uuid": request["render_uuid"]})
         assert other.hear_type("FileTransferStartDownload")["filename"] == "view.png"
-    handled.act(Action.SAVE_PAGE, silent)
+    handled.act("Page", silent)
     assert browser.hear(in_turn("FileTransferStartDownload", "GetRenderRequestMessage"))["type"].startswith(
         "File"
     )
@@ -274,8 +286,8 @@ def test_so_many_pictures_are_awaited_and_no_more(
 ) -> None:
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
     monkeypatch.setattr(downloads, "PICTURES_AT_ONCE", 1)
-    handled.act(Action.SAVE_PICTURE, handled.client_id())
-    handled.act(Action.SAVE_PICTURE, 1234)
+    handled.act("Picture", handled.client_id())
+    handled.act("Picture", 1234)
     notices = [item for item in drained(handled) if isinstance(item, m.Notice)]
     assert ["try again" in notice.text for notice in notices] == [True]
 
@@ -289,16 +301,16 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
         def as_html(self, dark: bool) -> str:
             made.append(dark)
             held.wait()
-            return "<head><script>window.__VISER_EMBED_DATA__=0;</script></head>"
+            return '<head><script>e.type="module"</script></head>'
 
     monkeypatch.setattr(handled.server, "get_scene_serializer", Scene)
     for _ in range(20):
-        handled.act(Action.SAVE_PAGE, client)
+        handled.act("Page", client)
     held.set()
     assert browser.hear_type("FileTransferStartDownload")["filename"] == "map.html"
     wait_for(lambda: not handled.page.downloads._begun, "the end of the work")
     assert len(made) == 1
-    handled.act(Action.SAVE_PAGE, client)
+    handled.act("Page", client)
     browser.hear_type("FileTransferStartDownload")
 
 

@@ -49,7 +49,7 @@ def test_what_is_put_in_and_not_removed_is_shown(
         coords = np.array(sorted(bricks), np.int32)
         if is_put:
             values = rng.integers(-3000, 3000, (len(coords), VOXELS)).astype(np.int16)
-            changed = store.put(coords, values, np.zeros_like(values, np.uint8))
+            changed = store.put(coords, log_odds=values)
             assert changed == {tuple(c) for c in (coords // 8).tolist()}
             known |= {tuple(c): v for c, v in zip(coords.tolist(), values, strict=True)}
         else:
@@ -63,7 +63,11 @@ def test_what_is_put_in_and_not_removed_is_shown(
 def test_counts_travel_with_their_voxels() -> None:
     store = VoxelStore()
     seen = np.arange(VOXELS, dtype=np.int64).reshape(1, -1) % 251
-    store.put(np.array([[-1, 2, 3]], np.int32), np.full((1, VOXELS), 9, np.int16), seen.astype(np.uint8))
+    store.put(
+        np.array([[-1, 2, 3]], np.int32),
+        log_odds=np.full((1, VOXELS), 9, np.int16),
+        seen=seen.astype(np.uint8),
+    )
     shown = store.shown((-1, 0, 0), 0.0, None)
     number = shown.cells % BRICK @ np.array([BRICK * BRICK, BRICK, 1])
     np.testing.assert_array_equal(shown.seen, number % 251)
@@ -81,18 +85,18 @@ def test_packing_keeps_the_sign_and_two_thousandths(log_odds: np.ndarray) -> Non
     assert np.all(np.abs(packed * LOG_ODDS_STEP - log_odds)[inside] <= LOG_ODDS_STEP)
 
 
-def block(*brick: int) -> tuple[np.ndarray, np.ndarray]:
-    """A brick that is occupied where x < 3, free where x > 4, unknown between; and its log-odds."""
+def put_block(store: VoxelStore, *brick: int) -> None:
+    """Put a brick that is occupied where x < 3, free where x > 4, unknown between."""
     x = offsets_in_brick()[:, 0]
     log_odds = np.select([x < 3, x > 4], [2.0, -6.0], -2.0).astype(np.float32)
-    return np.array([brick], np.int32), pack_log_odds(log_odds)[None]
+    store.put(np.array([brick], np.int32), log_odds=pack_log_odds(log_odds)[None])
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_cut_hides_what_lies_beyond_it(axis: int) -> None:
     store = VoxelStore()
     for brick in ((-9, 0, 0), (0, -9, 0), (0, 0, -9), (0, 0, 0)):
-        store.put(*block(*brick), np.zeros((1, VOXELS), np.uint8))
+        put_block(store, *brick)
     cut = Cut(axis, -5)
     everything, kept = world_of(store, -50.0), world_of(store, -50.0, cut)
     assert kept == {voxel: q for voxel, q in everything.items() if voxel[axis] <= cut.voxel}
@@ -104,7 +108,7 @@ def test_the_cut_shows_free_occupied_and_unknown_where_they_are(axis: int) -> No
     store = VoxelStore()
     bricks = [(-9, 0, 2), (1, -3, 0), (0, 0, 0)]
     for brick in bricks:
-        store.put(*block(*brick), np.zeros((1, VOXELS), np.uint8))
+        put_block(store, *brick)
     crossed = np.array([[0, -1, 1], [0, 0, 0], [50, 50, 50]], np.int32)
     cut = Cut(axis, 2)
     picture = cut_picture(store, cut, -2.0, 0.1, [crossed])
@@ -126,8 +130,8 @@ def test_the_cut_shows_free_occupied_and_unknown_where_they_are(axis: int) -> No
 def test_the_cut_goes_from_one_end_of_the_map_to_the_other() -> None:
     store = VoxelStore()
     assert cut_voxel(store, 0, 0.5) is None
-    store.put(*block(-2, 0, 0), np.zeros((1, VOXELS), np.uint8))
-    store.put(*block(3, 0, 0), np.zeros((1, VOXELS), np.uint8))
+    put_block(store, -2, 0, 0)
+    put_block(store, 3, 0, 0)
     assert cut_voxel(store, 0, 0.0) == Cut(0, -16)
     assert cut_voxel(store, 0, 1.0) == Cut(0, 31)
 

@@ -180,7 +180,7 @@ def test_the_page_opens_in_the_colours_of_photographs_where_the_picture_does() -
     running = SurfacePage()
     try:
         for chosen, expected in ((None, "photo"), ("uncertainty", "uncertainty"), (None, "photo")):
-            widget = running.page.panel._options.handles["color_by"]
+            widget = running.page.panel.view_options.handles["color_by"]
             widget.value = chosen or ViewOptions().color_by
             running.take(HELLO)
             running.take(replace(VIEW, photo=True))
@@ -199,7 +199,7 @@ def test_a_map_without_a_surface_offers_none() -> None:
     try:
         running.asked.clear()
         running.take(replace(HELLO, method="log_odds", has_surface=False))
-        assert running.page.panel._options.handles["show"].options == ("voxels",)
+        assert running.page.panel.view_options.handles["show"].options == ("voxels",)
         assert running.page.options.show == "voxels"
         assert running.asked == []
     finally:

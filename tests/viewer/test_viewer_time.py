@@ -9,7 +9,6 @@ from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import Action
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, ViewOptions
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
@@ -31,7 +30,7 @@ class TimePage(HandledPage):
     def move_to(self, seconds: float) -> m.Request:
         """Move the slider as a user does; returns what is then asked."""
         self.time.slider.value = seconds
-        self.page.actions[Action.SHOW_TIME](0)
+        self.page.actions["Time (s)"](0)
         return self.asked[-1]
 
 

@@ -8,11 +8,11 @@ import pytest
 from handled_page import HandledPage
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.viewer.transport.process import Used
+from taichi_mrf.viewer.scene.base_panel import Used
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.messages import Scores
 from taichi_mrf.viewer.tune.page import TunePage
-from taichi_mrf.viewer.tune.panel import Action, KnobMoved
+from taichi_mrf.viewer.tune.panel import KnobMoved
 
 FIRST = Config(voxel_size=0.1)
 OTHER = replace(FIRST, voxel_size=0.15)
@@ -32,7 +32,7 @@ class HandledTunePage(HandledPage):
         self.page.batch_done()
 
     def slider(self, name: str) -> Any:
-        return next(each for each in self.page.panel._knobs if name in each)._handles[name]
+        return self.page.panel._knobs._handles[name]
 
     def move(self, name: str, value: float) -> KnobMoved:
         self.slider(name).value = value
@@ -68,7 +68,7 @@ def test_the_sliders_follow_the_shown_try_unless_another_is_coming(handled: Hand
 def test_buttons_act_on_the_selected_try(handled: HandledTunePage) -> None:
     handled.take(t.Tried(1, OTHER, SCORES, "hand"))
     assert handled.page.panel.chosen_try() == 1
-    actions = (Action.PIN, Action.SAVE_YAML, Action.SAVE_CSV, Action.RESTORE)
+    actions = ("Pin", "Save YAML", "Save CSV", "Restore")
     handled.take(*[Used(action, 7) for action in actions])
     saves = [t.SaveTries("yaml", 1, 7), t.SaveTries("csv", 1, 7)]
     assert handled.asked == [t.Pin(1), *saves, t.Try(OTHER)]
@@ -77,7 +77,7 @@ def test_buttons_act_on_the_selected_try(handled: HandledTunePage) -> None:
 
 def test_without_a_try_there_is_a_notice(handled: HandledTunePage) -> None:
     handled.take(TUNING)  # another working set
-    handled.take(Used(Action.RESTORE, 0))
+    handled.take(Used("Restore", 0))
     assert handled.asked == []
     assert [notice.text for notice in handled.page.panel._notices] == ["There is no try yet."]
 
@@ -85,5 +85,5 @@ def test_without_a_try_there_is_a_notice(handled: HandledTunePage) -> None:
 def test_held_out_views_and_frames_are_asked_for(handled: HandledTunePage) -> None:
     handled.page.panel.view.value = "d"
     handled.page.panel._frames.handles["count"].value = 20
-    handled.take(Used(Action.CHOOSE_VIEW, 0), Used(Action.USE_FRAMES, 0), Used(Action.STOP_SEARCH, 0))
+    handled.take(Used("Held-out view", 0), Used("Use these frames", 0), Used("Stop the search", 0))
     assert handled.asked == [t.LookAt(1), t.ChooseFrames(t.FrameChoice(count=20)), t.StopSearch()]

@@ -1,31 +1,34 @@
 """The live page: what updates and events do to its scene and its widgets."""
 
 from collections.abc import Callable, Collection
+from functools import partial
 
 import numpy as np
 import viser
+import viser.transforms as vtf
 
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.answer import Closed, Point, SwitchOff, VoxelAnswer, beside, facts_of
 from taichi_mrf.viewer.live.panel import (
     CHOSEN_KEYFRAME,
     POSITION_STEP_M,
-    RESET_QUESTION,
     SPEEDS,
-    Action,
+    SWITCHES,
     Clicked,
     Dragged,
     Panel,
-    freeze_question,
+    Point,
+    VoxelAnswer,
+    beside,
+    facts_of,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
+from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.keyframe_layer import Placement
-from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import Side
-from taichi_mrf.viewer.transport.process import Inbox
+from taichi_mrf.viewer.scene.widgets import in_markdown
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
@@ -43,12 +46,11 @@ class Page(BasePage[Panel]):
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
         self._hello: m.Hello
         self._eye: Point = (0.0, 0.0, 0.0)  # from where the voxel of the answer was clicked
-        self.answer = VoxelAnswer(server.scene, server.gui, inbox)
+        self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
         self._edits: list[tuple[Edit, Edit]] = []
         """Edits that can be taken back and made again: what undoes each, and itself."""
         self._done = 0  # how many of them are made
-        self._to_freeze: dict[int, int] = {}  # the keyframe that each client is asked about
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
@@ -60,8 +62,6 @@ class Page(BasePage[Panel]):
             m.Status: self._take_status,
             m.RayAnswer: self._show_ray,
             m.Votes: self._show_votes,
-            SwitchOff: self._switch_off,
-            Closed: lambda closed: self.answer.clear(),
             m.Images: self.panel.show_images,
             m.TimeSpan: self.panel.time.show_span,
             m.SceneChanges: self.panel.time.show_changes,
@@ -69,36 +69,40 @@ class Page(BasePage[Panel]):
             Dragged: self._dragged,
         }
         self.actions |= {
-            Action.PLAY: lambda client: ask(m.Pause(False)),
-            Action.PAUSE: lambda client: ask(m.Pause(True)),
-            Action.STEP: lambda client: ask(m.Step()),
-            Action.SPEED: lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
-            Action.TOP: lambda client: self._look_from(client, "top"),
-            Action.FRONT: lambda client: self._look_from(client, "front"),
-            Action.SIDE: lambda client: self._look_from(client, "side"),
-            Action.FIT: lambda client: self._look_from(client, "here"),
-            Action.FOLLOW: lambda client: self.panel.set_following(),
-            Action.RESET: self._reset,
-            Action.RESET_CONFIRMED: self._reset_confirmed,
-            Action.UNDO: lambda client: self._undo(),
-            Action.REDO: lambda client: self._redo(),
-            Action.CANCELLED: self.panel.close_question,
-            Action.CHOOSE_KEYFRAME: lambda client: self._choose(self.panel.chosen_keyframe()),
-            Action.SWITCH: lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
-            Action.FREEZE: self._freeze,
-            Action.FREEZE_CONFIRMED: self._freeze_confirmed,
-            Action.TOGGLE_GIZMO: lambda client: self._toggle_gizmo(),
-            Action.PUT_BACK: lambda client: self._edit(self._move_home),
-            Action.SET_POSITION: lambda client: self._edit(self._move_as_typed),
-            Action.SHOW_PIXEL_RAY: lambda client: self._edit(self._ray_of_pixel),
-            Action.WATCH_IMAGES: lambda client: self._watch_images(),
-            Action.SHOW_TIME: lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
-            Action.SAVE_MAP: lambda client: ask(m.Save("map", client)),
-            Action.SAVE_VOXELS: lambda client: ask(m.Save("ply", client)),
-            Action.SAVE_MESH: lambda client: ask(m.Save("mesh", client)),
-            Action.SAVE_PICTURE: self.downloads.picture,
-            Action.SAVE_PAGE: lambda client: self.downloads.page(client, self.options.dark),
-            Action.RECORD: self._record,
+            "Play": lambda client: ask(m.Pause(False)),
+            "Pause": lambda client: ask(m.Pause(True)),
+            "Step": lambda client: ask(m.Step()),
+            "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
+            "Top": partial(self._look_from, "top"),
+            "Front": partial(self._look_from, "front"),
+            "Side": partial(self._look_from, "side"),
+            "Fit": partial(self._look_from, "here"),
+            "Follow": lambda client: self.panel.set_following(),
+            "Reset": self._reset,
+            "Delete the map and start again": self.panel.agree,
+            "Undo": lambda client: self._undo(),
+            "Redo": lambda client: self._redo(),
+            "Keep the map": self.panel.close_question,
+            "Leave it as it is": self.panel.close_question,
+            "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
+            "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
+            "Freeze": self._freeze,
+            "Freeze it": self.panel.agree,
+            "Move": lambda client: self._toggle_gizmo(),
+            "Put back": lambda client: self._edit(self._move_home),
+            "Position (m)": lambda client: self._edit(self._move_as_typed),
+            "Show the ray": lambda client: self._edit(self._ray_of_pixel),
+            "Show images": lambda client: self._watch_images(),
+            "View": lambda client: self._watch_images(),
+            "Time (s)": lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
+            "Map": lambda client: ask(m.Save("map", client)),
+            "Voxels": lambda client: ask(m.Save("ply", client)),
+            "Mesh": lambda client: ask(m.Save("mesh", client)),
+            "Picture": self.downloads.picture,
+            "Page": lambda client: self.downloads.page(client, self.options.dark),
+            "Recording": self._record,
+            "Close": lambda client: self.answer.clear(),
+            **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
         server.scene.on_click()(lambda event: inbox.put(_click_of(event)))
 
@@ -108,7 +112,7 @@ class Page(BasePage[Panel]):
         if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
 
-    def _look_from(self, client: int, side: Side) -> None:
+    def _look_from(self, side: Side, client: int) -> None:
         """Show the whole map to one client, and follow the camera no more."""
         self.panel.set_following(False)
         self._take_options()
@@ -126,7 +130,7 @@ class Page(BasePage[Panel]):
         self.panel.ray.clear()
         self.panel.show_hello(hello)
         self.panel.show_keyframes({}, None)
-        self.options = self.panel.options()  # what this map cannot show is not offered any more
+        self.options = self.panel.view_options.value()  # what this map cannot show is not offered any more
         if self._extras(self.options) != self._extras(_PLAIN):
             self._ask_for_extras()
 
@@ -180,24 +184,29 @@ class Page(BasePage[Panel]):
         if handle is None or not self.keyframes.keyframes:
             self.ask(m.Reset())
         else:
-            self.panel.ask(handle, RESET_QUESTION)
-
-    def _reset_confirmed(self, client: int) -> None:
-        self.panel.close_question(client)
-        self.ask(m.Reset())
+            self.panel.ask(
+                handle,
+                "Reset the map?",
+                "This deletes the map and all edits of its keyframes, and maps the source again from its "
+                "first frame. To keep the map, save it first.",
+                "Delete the map and start again",
+                "Keep the map",
+                lambda: self.ask(m.Reset()),
+            )
 
     def _freeze(self, client: int) -> None:
         """Ask before the chosen keyframe is frozen."""
         handle, chosen = self.server.get_clients().get(client), self._changeable()
         if handle is not None and chosen is not None:
-            self._to_freeze[client] = chosen.id
-            self.panel.ask(handle, freeze_question(chosen))
-
-    def _freeze_confirmed(self, client: int) -> None:
-        self.panel.close_question(client)
-        keyframe = self._to_freeze.pop(client, None)
-        if keyframe in self.keyframes.keyframes:
-            self.ask(m.Freeze(keyframe))
+            self.panel.ask(
+                handle,
+                "Freeze the keyframe?",
+                f"This makes the evidence of keyframe {chosen.id} ({in_markdown(chosen.name)}) permanent and "
+                "drops its image: it can never be switched off, moved or looked at again.",
+                "Freeze it",
+                "Leave it as it is",
+                lambda: self.ask(m.Freeze(chosen.id)) if chosen.id in self.keyframes.keyframes else None,
+            )
 
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)
@@ -285,8 +294,8 @@ class Page(BasePage[Panel]):
         self.keyframes.held = dragged.holding
         gizmo, keyframe = self.keyframes.gizmo, self.keyframes.chosen
         if gizmo is not None and keyframe is not None and not dragged.holding:
-            place = Placement(np.array(gizmo.wxyz), np.array(gizmo.position))
-            self._make(m.Move(keyframe, place.pose()))
+            pose = vtf.SE3(np.array([*gizmo.wxyz, *gizmo.position], np.float64))
+            self._make(m.Move(keyframe, np.asarray(pose.as_matrix(), np.float64)))
 
     def _choose(self, keyframe: int | None) -> None:
         if keyframe == self.keyframes.chosen:
@@ -336,9 +345,10 @@ class Page(BasePage[Panel]):
             facts = facts_of(np.array(answer.point), self.map.store, self._hello)
             self.answer.show(facts, votes, answer.known)
 
-    def _switch_off(self, switch: SwitchOff) -> None:
-        """Switch a keyframe off, and show what the others say of the voxel."""
-        listed = self.answer.said_by[switch.number : switch.number + 1]
+    def _switch_off(self, place: int, client: int) -> None:
+        """Switch off the keyframe at a place of the answer's list, and show what the others say of the
+        voxel."""
+        listed = self.answer.said_by[place : place + 1]
         if listed and self.keyframes.keyframes[listed[0]].state == "on" and self.answer.point is not None:
             self._make(m.Switch(listed[0], False))
             self.ask(m.RayThrough(self.answer.point, self._eye, self.keyframes.chosen))

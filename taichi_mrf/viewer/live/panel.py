@@ -1,64 +1,33 @@
-"""The widgets of the live page, with the folder "Time" of a map whose world may change. The page decides what
-they do.
+"""The widgets of the live page, with the folder "Time" of a map whose world may change, and the answer to a
+click on a voxel in a panel beside it. The page decides what they do.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from taichi_mrf.viewer.messages import (
-    Hello,
-    Images,
-    KeyframeInfo,
-    SceneChange,
-    SceneChanges,
-    Status,
-    TimeSpan,
-)
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html, in_markdown
-from taichi_mrf.viewer.transport.process import Event
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore
+from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
 
+Point = tuple[float, float, float]
+Vote = tuple[m.KeyframeInfo, float]
+"""A keyframe, and the log-odds that it adds to a voxel."""
 
-class Action(Enum):
-    """A button, or a widget whose value asks the mapping process for something."""
+SWITCHES = tuple(f"switch off {place}" for place in range(5))
+"""Actions of the buttons beside what keyframes say of a voxel, by their places in the list."""
 
-    PLAY = auto()
-    PAUSE = auto()
-    STEP = auto()
-    SPEED = auto()
-    TOP = auto()
-    FRONT = auto()
-    SIDE = auto()
-    FIT = auto()
-    FOLLOW = auto()
-    RESET = auto()
-    RESET_CONFIRMED = auto()
-    CHOOSE_KEYFRAME = auto()
-    SWITCH = auto()
-    FREEZE = auto()
-    FREEZE_CONFIRMED = auto()
-    CANCELLED = auto()
-    UNDO = auto()
-    REDO = auto()
-    TOGGLE_GIZMO = auto()
-    PUT_BACK = auto()
-    SET_POSITION = auto()
-    SHOW_PIXEL_RAY = auto()
-    WATCH_IMAGES = auto()
-    SHOW_TIME = auto()
-    SAVE_MAP = auto()
-    SAVE_VOXELS = auto()
-    SAVE_MESH = auto()
-    SAVE_PICTURE = auto()
-    SAVE_PAGE = auto()
-    RECORD = auto()
+_ASIDE_PX, _WIDTH_PX, _HEIGHT_PX = 65, 290, 430
+"""Size of the panel with all buttons, and its distance from the voxel."""
+
+_LINE_COLOR = (255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -78,45 +47,26 @@ class Dragged(Event):
     holding: bool
 
 
-RUN_BUTTONS = {
-    "Play": Action.PLAY, "Pause": Action.PAUSE, "Step": Action.STEP, "Reset": Action.RESET,
-}  # fmt: skip
-VIEW_BUTTONS = {
-    "Top": Action.TOP, "Front": Action.FRONT, "Side": Action.SIDE, "Fit": Action.FIT,
-}  # fmt: skip
-HISTORY_BUTTONS = {"Undo": Action.UNDO, "Redo": Action.REDO}
+RUN_BUTTONS = ("Play", "Pause", "Step", "Reset")
+HISTORY_BUTTONS = ("Undo", "Redo")
 COMMANDS = {
-    "Look from the top": (Action.TOP, "1", None),
-    "Look from the front": (Action.FRONT, "2", None),
-    "Look from the side": (Action.SIDE, "3", None),
-    "Fit the whole map into the window": (Action.FIT, "0", None),
-    "Follow the camera, or stop following": (Action.FOLLOW, "F", None),
-    "Undo the last edit": (Action.UNDO, "Z", "cmd/ctrl"),
-    "Redo the edit": (Action.REDO, "Z", "cmd/ctrl+shift"),
+    "Look from the top": ("Top", "1", None),
+    "Look from the front": ("Front", "2", None),
+    "Look from the side": ("Side", "3", None),
+    "Fit the whole map into the window": ("Fit", "0", None),
+    "Follow the camera, or stop following": ("Follow", "F", None),
+    "Undo the last edit": ("Undo", "Z", "cmd/ctrl"),
+    "Redo the edit": ("Redo", "Z", "cmd/ctrl+shift"),
 }
 """Entries of the command palette: action, key, and the key that is held with it."""
-EDIT_BUTTONS = {
-    "On/off": Action.SWITCH,
-    "Freeze": Action.FREEZE,
-    "Move": Action.TOGGLE_GIZMO,
-    "Put back": Action.PUT_BACK,
-}
+EDIT_BUTTONS = ("On/off", "Freeze", "Move", "Put back")
 SAVE_BUTTONS = {
-    "Map": (
-        Action.SAVE_MAP,
-        "The map with its keyframes: a .npz file for `taichi-mrf live` and `MRFMap.load`.",
-    ),
-    "Voxels": (
-        Action.SAVE_VOXELS,
-        "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
-    ),
-    "Mesh": (
-        Action.SAVE_MESH,
-        "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
-    ),
-    "Picture": (Action.SAVE_PICTURE, "What this browser shows, as a .png file."),
-    "Page": (Action.SAVE_PAGE, "The scene as one .html file that any browser opens, without a server."),
-    "Recording": (Action.RECORD, "Start recording the scene; press again to get it as a .viser file."),
+    "Map": "The map with its keyframes: a .npz file for `taichi-mrf live` and `MRFMap.load`.",
+    "Voxels": "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
+    "Mesh": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
+    "Picture": "What this browser shows, as a .png file.",
+    "Page": "The scene as one .html file that any browser opens, without a server.",
+    "Recording": "Start recording the scene; press again to get it as a .viser file.",
 }
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
@@ -129,56 +79,24 @@ _MAP_OPTIONS = (
 TIME_STEP_S = 0.1
 
 
-@dataclass(frozen=True)
-class Question:
-    """Question before something that cannot be undone: ``yes`` does it, by ``action``."""
-
-    title: str
-    text: str
-    yes: str
-    no: str
-    action: Action
-
-
-RESET_QUESTION = Question(
-    "Reset the map?",
-    "This deletes the map and all edits of its keyframes, and maps the source again from its first frame. To "
-    "keep the map, save it first.",
-    "Delete the map and start again",
-    "Keep the map",
-    Action.RESET_CONFIRMED,
-)
-
-
-def freeze_question(keyframe: KeyframeInfo) -> Question:
-    """Before a keyframe is frozen."""
-    return Question(
-        "Freeze the keyframe?",
-        f"This makes the evidence of keyframe {keyframe.id} ({in_markdown(keyframe.name)}) permanent and "
-        "drops its image: it can never be switched off, moved or looked at again.",
-        "Freeze it",
-        "Leave it as it is",
-        Action.FREEZE_CONFIRMED,
-    )
-
-
 class Panel(BasePanel):
     """Adds the widgets, and shows values in them."""
 
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
-        self._questions: dict[int, Any] = {}
+        self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
-        self.speed: Any = gui.add_dropdown(
-            "Speed", list(SPEEDS), hint="Replay the recording at this multiple of its own pace."
-        )
-        self.watch(self.speed, Action.SPEED)
+        hint = "Replay the recording at this multiple of its own pace."
+        self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
         self.add_legend()
         self.add_counts()
-        self.add_buttons("View", VIEW_BUTTONS, "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.")
-        self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
-        self._options.add("follow")
+        self.add_buttons(
+            "View",
+            ("Top", "Front", "Side", "Fit"),
+            "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.",
+        )
+        self.view_options.add("follow")
         for label, command in COMMANDS.items():
             self.add_command(label, *command)
         hint = "Ctrl-Z takes the last edit back, Ctrl-Shift-Z makes it again; a frozen keyframe stays."
@@ -186,13 +104,13 @@ class Panel(BasePanel):
         self.show_history(False, False)
         self.time = TimeFolder(gui, self)
         with self.time.folder:
-            self._options.add("dynamic")
+            self.view_options.add("dynamic")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
-            self._options.add(*_MAP_OPTIONS)
+            self.view_options.add(*_MAP_OPTIONS)
             with gui.add_folder("Space"):
-                self._options.add("ground", "axes")
-            self._options.add("pictures", "dark")
+                self.view_options.add("ground", "axes")
+            self.view_options.add("pictures", "dark")
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
         with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
@@ -200,38 +118,32 @@ class Panel(BasePanel):
         with tabs.add_tab("Images", viser.Icon.PHOTO):
             self._images_tab()
         with tabs.add_tab("Save", viser.Icon.DOWNLOAD):
-            for name, (action, hint) in SAVE_BUTTONS.items():
-                self.add_button(name, action, hint)
+            for name, hint in SAVE_BUTTONS.items():
+                self.add_button(name, hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._numbers = gui.add_html("")
             self.add_notices()
             self._parameters = gui.add_html("")
 
-    def options(self) -> ViewOptions:
-        """The view options as the widgets stand."""
-        return self._options.value()
-
-    def show_hello(self, hello: Hello) -> None:
+    def show_hello(self, hello: m.Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
-        self._options.offer("color_by", _colors_of(hello))
-        self._options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
+        self.view_options.offer("color_by", _colors_of(hello))
+        self.view_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
         )
-        self._edits.options = tuple(
-            label for label, action in EDIT_BUTTONS.items() if hello.can_freeze or action is not Action.FREEZE
-        )
+        self._edits.options = tuple(label for label in EDIT_BUTTONS if hello.can_freeze or label != "Freeze")
         self._offer_replay(hello.has_frames)
         self.clear_notices()
 
     def _offer_replay(self, has_frames: bool) -> None:
         """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
-        self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
+        self._run.options = RUN_BUTTONS if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
-        self._options.handles["follow"].visible = has_frames
+        self.view_options.handles["follow"].visible = has_frames
 
     def show_history(self, can_undo: bool, can_redo: bool) -> None:
         """Offer to take edits back, and to make them again, if there are any."""
@@ -243,16 +155,16 @@ class Panel(BasePanel):
 
     def set_following(self, on: bool | None = None) -> None:
         """Set the box that follows the camera; None turns it over."""
-        box = self._options.handles["follow"]
+        box = self.view_options.handles["follow"]
         box.value = (not box.value) if on is None else on
 
     def color_by_photo(self) -> None:
         """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
-        widget = self._options.handles["color_by"]
+        widget = self.view_options.handles["color_by"]
         if widget.value == ViewOptions().color_by:
             widget.value = "photo"
 
-    def show_status(self, status: Status) -> None:
+    def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         self.show_activity(status.activity, status.share, not (status.paused or status.finished))
         self._show_speed(status.speed)
@@ -285,7 +197,7 @@ class Panel(BasePanel):
         if self.speed.value != name:
             self.speed.value = name
 
-    def show_keyframes(self, keyframes: dict[int, KeyframeInfo], chosen: int | None) -> None:
+    def show_keyframes(self, keyframes: dict[int, m.KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
@@ -311,7 +223,7 @@ class Panel(BasePanel):
         """The keyframe that is selected in the dropdown."""
         return self._names.get(self.keyframe.value)
 
-    def show_images(self, images: Images) -> None:
+    def show_images(self, images: m.Images) -> None:
         """Show the images of one view."""
         self._measured.image, self._rendered.image = images.measured, images.rendered
         self._accuracy.image = images.accuracy
@@ -325,37 +237,40 @@ class Panel(BasePanel):
             picture.visible = False
         self._score.content = ""
 
-    def ask(self, client: viser.ClientHandle, question: Question) -> None:
-        """Ask one user to confirm what cannot be undone."""
+    def ask(
+        self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str, then: Callable[[], None]
+    ) -> None:
+        """Ask one user to confirm what cannot be undone, which ``then`` does. The answers are actions, for
+        :meth:`agree` and :meth:`close_question`."""
         self.close_question(client.client_id)
-        modal = self._questions[client.client_id] = client.gui.add_modal(question.title)
+        modal = client.gui.add_modal(title)
+        self._questions[client.client_id] = modal, then
         with modal:
-            client.gui.add_markdown(question.text)
-            yes = client.gui.add_button(question.yes, color="red")
-            yes.on_click(partial(self._used, action=question.action))
-            no = client.gui.add_button(question.no)
-            no.on_click(partial(self._used, action=Action.CANCELLED))
+            client.gui.add_markdown(text)
+            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, yes))
+            client.gui.add_button(no).on_click(lambda event: self.used(event, no))
 
     def close_question(self, client: int) -> None:
         """Close the question."""
-        modal = self._questions.pop(client, None)
+        modal, _ = self._questions.pop(client, (None, None))
         if modal is not None and not modal.closed:
             modal.close()
 
+    def agree(self, client: int) -> None:
+        """Close the question, and do what was asked."""
+        _, then = self._questions.get(client, (None, lambda: None))
+        self.close_question(client)
+        then()
+
     def _keyframe_tab(self) -> None:
         gui = self.gui
-        self.keyframe: Any = gui.add_dropdown(
-            "Keyframe", [NO_KEYFRAME], hint="The keyframe that the buttons change. Its frustum is magenta."
-        )
-        self.watch(self.keyframe, Action.CHOOSE_KEYFRAME)
+        hint = "The keyframe that the buttons change. Its frustum is magenta."
+        self.keyframe = self.watch(gui.add_dropdown("Keyframe", [NO_KEYFRAME], hint=hint))
         self._edits: Any = self.add_buttons("Edit", EDIT_BUTTONS)
-        self.position: Any = gui.add_vector3(
-            "Position (m)",
-            (0.0, 0.0, 0.0),
-            step=POSITION_STEP_M,
-            hint="Position of the keyframe's camera in the world; type another one to move the keyframe.",
+        hint = "Position of the keyframe's camera in the world; type another one to move the keyframe."
+        self.position = self.watch(
+            gui.add_vector3("Position (m)", (0.0, 0.0, 0.0), step=POSITION_STEP_M, hint=hint)
         )
-        self.watch(self.position, Action.SET_POSITION)
         self._keyframe_text = gui.add_markdown("")
         gui.add_markdown(
             "**On/off** removes the keyframe from the map, or adds it again. **Freeze** asks, and then makes "
@@ -368,15 +283,14 @@ class Panel(BasePanel):
             "Pixel (u, v)", (0.0, 0.0), step=1.0, hint="Column and row in the image of the chosen keyframe."
         )
         hint = "Show what the ray of this pixel of the chosen keyframe passes through."
-        self._pixel_button: Any = self.add_button("Show the ray", Action.SHOW_PIXEL_RAY, hint)
+        self._pixel_button: Any = self.add_button("Show the ray", hint)
         self.ray = RayPlot(self.gui, scene)
 
     def _images_tab(self) -> None:
         gui = self.gui
-        self.images = gui.add_checkbox("Show images", False, hint="Keep them up to date while mapping.")
-        self.view = gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME])
-        for widget in (self.images, self.view):
-            self.watch(widget, Action.WATCH_IMAGES)
+        hint = "Keep them up to date while mapping."
+        self.images = self.watch(gui.add_checkbox("Show images", False, hint=hint))
+        self.view = self.watch(gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
         self._score = gui.add_markdown("")
         black = np.zeros((2, 2, 3), np.uint8)
         self._measured = gui.add_image(black, label="measured depth", visible=False)
@@ -385,7 +299,7 @@ class Panel(BasePanel):
         self._accuracy = gui.add_image(black, label=label, visible=False)
 
 
-def _colors_of(hello: Hello) -> tuple[ColorBy, ...]:
+def _colors_of(hello: m.Hello) -> tuple[ColorBy, ...]:
     """Choices of what the colour shows of a map."""
     found = list(OF_BELIEFS)
     if hello.counts_keyframes:
@@ -399,21 +313,18 @@ class TimeFolder:
     """Adds the folder at the place where the GUI stands. Times on the page count from the first keyframe."""
 
     def __init__(self, gui: viser.GuiApi, panel: BasePanel) -> None:
-        self._span: TimeSpan | None = None
-        self._latest: tuple[SceneChange, ...] = ()
+        self._span: m.TimeSpan | None = None
+        self._latest: tuple[m.SceneChange, ...] = ()
         self.folder = gui.add_folder("Time", visible=False)
         with self.folder:
-            self.slider: Any = gui.add_slider(
-                "Time (s)",
-                min=0.0,
-                max=TIME_STEP_S,
-                step=TIME_STEP_S,
-                initial_value=TIME_STEP_S,
-                disabled=True,
-                hint="Show the map as it was believed at this time, in all browsers. The right end is now "
-                "and follows new keyframes. An edit returns to now.",
+            hint = (
+                "Show the map as it was believed at this time, in all browsers. The right end is now "
+                "and follows new keyframes. An edit returns to now."
             )
-            panel.watch(self.slider, Action.SHOW_TIME)
+            least, most, now = 0.0, TIME_STEP_S, TIME_STEP_S
+            self.slider = panel.watch(
+                gui.add_slider("Time (s)", least, most, TIME_STEP_S, now, disabled=True, hint=hint)
+            )
             self._list = gui.add_html("", visible=False)
             gui.add_html(dynamic_legend_html())
 
@@ -430,7 +341,7 @@ class TimeFolder:
             return None
         return max(self._span.first_s, self._span.start_s + float(self.slider.value))
 
-    def show_span(self, span: TimeSpan) -> None:
+    def show_span(self, span: m.TimeSpan) -> None:
         """Set the slider's ends, and the time that is shown."""
         known, self._span = self._span is not None, span
         last_s = max(_on_grid(span.now_s - span.start_s), TIME_STEP_S)
@@ -443,7 +354,7 @@ class TimeFolder:
         if not known:
             self._show_list()
 
-    def show_changes(self, changes: SceneChanges) -> None:
+    def show_changes(self, changes: m.SceneChanges) -> None:
         """List what has appeared and left, the latest first."""
         self._latest = changes.changes
         self._show_list()
@@ -457,7 +368,7 @@ class TimeFolder:
         self._list.content = f'<div style="padding:0 0.75em;font-size:0.8em">{items}</div>'
 
 
-def _in_words(change: SceneChange, start_s: float) -> str:
+def _in_words(change: m.SceneChange, start_s: float) -> str:
     size = " x ".join(f"{side:.1f}" for side in change.size_m)
     centre = ", ".join(f"{value:.1f}" for value in change.centre_m)
     return f"{change.stamp_s - start_s:.1f} s: something of {size} m {change.verb} at ({centre})"
@@ -465,3 +376,89 @@ def _in_words(change: SceneChange, start_s: float) -> str:
 
 def _on_grid(seconds: float) -> float:
     return round(round(seconds / TIME_STEP_S) * TIME_STEP_S, 6)
+
+
+class VoxelAnswer:
+    """Owns a floating panel, and the scene nodes /answer, a label at the voxel, and /distance."""
+
+    def __init__(self, scene: viser.SceneApi, panel: BasePanel) -> None:
+        self._scene = scene
+        self.point: Point | None = None
+        """The voxel that is shown, in metres, world; None without one."""
+        self._apart: dict[str, str] = {}
+        self._panel = panel.gui.add_panel(visible=False)
+        with self._panel.add_tab("Voxel", viser.Icon.CUBE):
+            self._text = panel.gui.add_html("")
+            hint = "Remove this keyframe from the map."
+            self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
+            panel.add_button("Close", color="gray")
+        self.said_by: list[int] = []
+        """The keyframes that are listed."""
+
+    def move(self, point: Point, place: tuple[float, float]) -> None:
+        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and draw a line from the voxel
+        before."""
+        before, self.point = self.point, point
+        self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
+        self._panel.visible = True
+        if before is not None and before != point:
+            ends = np.array([before, point])
+            self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
+            self._scene.add_line_segments(
+                "/distance",
+                ends[None].astype(np.float32),
+                _LINE_COLOR,
+                thickness=2.0,
+                thickness_units="screen",
+            )
+
+    def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
+        """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest
+        first, each with a button; ``known`` is None before they have been asked."""
+        self._scene.add_label("/answer", facts["state"], position=np.array(self.point))
+        text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
+        if known:
+            seen_by = f"{len(votes)} keyframes see it" if len(votes) > 1 else "one keyframe sees it"
+            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees it"
+        self._text.content = (
+            f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
+        )
+        self.said_by = [keyframe.id for keyframe, _ in votes[: len(SWITCHES)]]
+        for i, button in enumerate(self._switches):
+            button.visible = i < len(self.said_by)
+            if button.visible:
+                button.label = f"Switch off {votes[i][0].name}: {in_words(votes[i][1])}"
+
+    def clear(self) -> None:
+        """Hide the answer, and remove the line from the scene."""
+        self.point, self._apart, self.said_by, self._panel.visible = None, {}, [], False
+        for name in ("/answer", "/distance"):
+            self._scene.remove_by_name(name)
+
+
+def beside(x: float, y: float, width: int, height: int) -> tuple[float, float]:
+    """The panel's upper left corner, in pixels: beside a click at (x, y) in a window of this size, towards
+    its middle, as far as it fits in."""
+    left = x + _ASIDE_PX if x < 0.45 * width else x - _ASIDE_PX - _WIDTH_PX
+    return max(left, 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
+
+
+def in_words(log_odds: float) -> str:
+    """What a keyframe alone would say of a voxel."""
+    sure = 1 / (1 + np.exp(-abs(log_odds)))
+    return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
+
+
+def facts_of(point: NDArray[np.float64], store: VoxelStore, hello: m.Hello) -> dict[str, str]:
+    """Coordinates, state, probability and colour of the voxel at a point (3,) in metres, as shown."""
+    facts = {"x, y, z (m)": ", ".join(f"{value:.2f}" for value in point)}
+    found = store.voxel(np.floor(point / hello.voxel_size).astype(np.int64))
+    if found is None:
+        return facts | {"state": "unknown"}
+    log_odds = found[0] * m.LOG_ODDS_STEP
+    known = abs(log_odds - hello.prior_log_odds) >= hello.min_evidence
+    facts["state"] = "unknown" if not known else "occupied" if log_odds >= 0 else "free"
+    facts["probability"] = f"{1 / (1 + np.exp(-log_odds)):.3f}"
+    if found[1] is not None:
+        facts["colour (RGB)"] = ", ".join(str(part) for part in found[1].tolist())
+    return facts

@@ -1,27 +1,33 @@
-"""Base of the live page and the tuning page: one inbox, one thread, one scene.
+"""Base of the live page and the tuning page: one inbox, one thread, one scene; and the viewer's process,
+which has a page on its main thread and a thread that reads what the mapping process sends.
 
 All updates from the mapping process and all events from browsers go into one inbox and are handled on one
 thread, so no two threads ever change the same node. A page registers a handler for each kind of item and for
 each action.
 """
 
+import os
+import signal
+import threading
 import time
 from collections.abc import Callable
-from enum import Enum
+from multiprocessing.connection import Connection
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.base_panel import BasePanel, pop_up
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used, pop_up
 from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
-from taichi_mrf.viewer.transport.process import Inbox, Item, Joined, OptionsMoved, Used
+from taichi_mrf.viewer.transport.pulse import Pulse
+from taichi_mrf.viewer.transport.server import start_server
 
 P = TypeVar("P", bound=BasePanel)
 
@@ -53,7 +59,7 @@ class BasePage(Generic[P]):
         self.map: MapScene | None = None
         self._scale: Scale | None = None
         self._with_baseline = False
-        self.actions: dict[Enum, Callable[[int], None]] = {}
+        self.actions: dict[str, Callable[[int], None]] = {}
         """Function of each action, given the client that asked for it."""
         self.handlers: dict[type, Callable[[Any], None]] = {
             m.Notice: self.notify,
@@ -110,7 +116,7 @@ class BasePage(Generic[P]):
         time.sleep(_HEAD_START_S)
 
     def _take_options(self) -> None:
-        before, self.options = self.options, self.panel.options()
+        before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
         if self.options.dark != before.dark:
@@ -166,3 +172,54 @@ def _latest(batch: list[Item]) -> list[Item]:
             seen.add(type(item))
         kept.append(item)
     return kept[::-1]
+
+
+NewPage = Callable[[viser.ViserServer, Callable[[m.Request], None]], BasePage[Any]]
+"""Makes a page from the server and the function that sends a request to the mapping process."""
+
+
+def run_viewer(connection: "Connection[Any, Any]", host: str, port: int, new_page: NewPage) -> None:
+    """Serve a page until the mapping process sends Quit or ends.
+
+    The first message back is Listening, or a Notice that says why there is no page.
+    """
+    # The mapping process gets these signals too, and tells this one when to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    pulse = Pulse(os.getppid())
+    try:
+        server = start_server(host, port, "taichi_mrf", pulse)
+    except ViewerError as error:
+        connection.send(m.Notice(str(error), "error"))
+        return
+    lock = threading.Lock()
+
+    def ask(request: m.Request) -> None:
+        with lock:
+            try:
+                connection.send(request)
+            except OSError:
+                page.inbox.put(None)
+
+    page = new_page(server, ask)
+    ask(m.Listening(server.get_host(), server.get_port()))
+    threading.Thread(target=_read, args=(connection, page, pulse), daemon=True, name="reader").start()
+    try:
+        page.run()
+    finally:
+        server.stop()
+
+
+def _read(connection: "Connection[Any, Any]", page: BasePage[Any], pulse: Pulse) -> None:
+    """Put all updates into the page's inbox until the connection ends."""
+    try:
+        while True:
+            pulse.heard()
+            update = connection.recv()
+            if isinstance(update, m.Quit):
+                break
+            if not isinstance(update, m.Alive):
+                page.inbox.put(update)
+    except (EOFError, OSError):
+        pass
+    page.inbox.put(None)

@@ -1,17 +1,65 @@
-"""The widgets that both pages have: what is being done, counts, legend, notices; and how widgets of an action
-are added."""
+"""The widgets that both pages have: what is being done, counts, legend, notices; how widgets of an action are
+added; and the events that their use puts into the page's inbox.
 
-from collections.abc import Callable, Iterable, Mapping
-from enum import Enum
+Updates come into the inbox from the mapping process, events from the browsers; None ends the page, whose own
+thread takes them out. viser runs callbacks on a pool of threads: a callback only puts an event into it.
+"""
+
+import queue
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import viser
 
-from taichi_mrf.viewer.messages import Notice
+from taichi_mrf.viewer.messages import Notice, Update
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.widgets import in_html
-from taichi_mrf.viewer.transport.process import Event, OptionsMoved, Used
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
+
+
+class Event:
+    """Base of what a user or a browser does; the pages add their own."""
+
+
+@dataclass(frozen=True)
+class Joined(Event):
+    """A browser has connected."""
+
+    client: int
+
+
+@dataclass(frozen=True)
+class OptionsMoved(Event):
+    """A widget of the view options was used; the latest values count."""
+
+
+@dataclass(frozen=True)
+class Used(Event):
+    """A client used the widget of an action: it pressed the button, or changed the value. The action has the
+    name of the widget."""
+
+    action: str
+    client: int
+
+
+Item = Update | Event | None
+
+
+class Inbox(queue.SimpleQueue[Item]):
+    """A queue that any thread may fill."""
+
+    def wait(self, patience_s: float | None) -> list[Item]:
+        """All items in the queue. Waits for the first one for at most ``patience_s`` seconds (None: without
+        limit), and returns an empty list if none has come by then."""
+        try:
+            batch = [self.get(timeout=patience_s)]
+        except queue.Empty:
+            return []
+        while not self.empty():
+            batch.append(self.get())
+        return batch
+
 
 Tell = Callable[[Event], None]
 
@@ -39,17 +87,10 @@ class BasePanel:
     def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
         self.gui, self._tell = gui, tell
+        self.view_options = OptionWidgets(gui, ViewOptions(), lambda: tell(OptionsMoved()))
         self._notices: list[Notice] = []
         self._activity = gui.add_html(_activity_html("Starting …"))
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
-
-    def options(self) -> ViewOptions:
-        """The view options as the widgets stand."""
-        raise NotImplementedError
-
-    def options_moved(self) -> None:
-        """Callback of the widgets of view options, for when one of them was used."""
-        self._tell(OptionsMoved())
 
     def add_counts(self) -> None:
         """Add the line that says how many voxels the page shows."""
@@ -63,26 +104,28 @@ class BasePanel:
         """Add the list of the latest notices."""
         self._notice_list = self.gui.add_html("")
 
-    def add_button(self, label: str, action: Enum, hint: str | None = None, **options: Any) -> Any:
-        """Add a button."""
+    def add_button(self, label: str, hint: str | None = None, action: str = "", **options: Any) -> Any:
+        """Add a button, whose action has the name that is written on it unless ``action`` is given."""
         button = self.gui.add_button(label, hint=hint, **options)
-        button.on_click(lambda event: self._used(event, action))
+        button.on_click(lambda event: self.used(event, action or label))
         return button
 
-    def add_buttons(self, label: str, actions: Mapping[str, Enum], hint: str | None = None) -> Any:
-        """Add a row of buttons: what is written on each, and its action."""
+    def add_buttons(self, label: str, actions: Sequence[str], hint: str | None = None) -> Any:
+        """Add a row of buttons: the action of each has the name that is written on it."""
         group = self.gui.add_button_group(label, tuple(actions), hint=hint)
-        group.on_click(lambda event: self._used(event, actions[event.target.value]))
+        group.on_click(lambda event: self.used(event, event.target.value))
         return group
 
-    def add_command(self, label: str, action: Enum, key: Any, modifier: Any = None) -> None:
+    def add_command(self, label: str, action: str, key: Any, modifier: Any = None) -> None:
         """Add an entry of the command palette (Ctrl-K) with a key; keys do nothing while text is typed."""
         command = self.gui.add_command(label, hotkey=key, modifier=modifier)
-        command.on_trigger(lambda event: self._used(event, action))
+        command.on_trigger(lambda event: self.used(event, action))
 
-    def watch(self, widget: Any, action: Enum) -> None:
-        """Take each change of a widget's value by a user as this action; the page's own changes are none."""
-        widget.on_update(lambda event: self._used(event, action))
+    def watch(self, widget: Any) -> Any:
+        """Take each change of a widget's value by a user as the action of the widget's label; the page's own
+        changes are none. Returns the widget."""
+        widget.on_update(lambda event: self.used(event, widget.label))
+        return widget
 
     def show_activity(self, text: str, share: float, moving: bool) -> None:
         """Show what is being done and how much of it is, 0 to 1; ``moving`` animates the bar."""
@@ -114,7 +157,8 @@ class BasePanel:
         self._notices.clear()
         self._notice_list.content = notices_html([])
 
-    def _used(self, event: viser.GuiEvent | viser.CommandEvent, action: Enum) -> None:
+    def used(self, event: Any, action: str) -> None:
+        """Callback of what a user does with viser's widgets."""
         if event.client_id is not None:
             self._tell(Used(action, event.client_id))
 

@@ -1,6 +1,8 @@
 """Keyframes that the page keeps, and in the scene: small frusta or rings with their depth images, the
-camera's path, the current camera."""
+camera's path, the current camera; and the target of a click into the scene: a voxel, or a pixel of a
+keyframe's picture."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,25 +33,10 @@ CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """A pose as viser takes it."""
-
-    wxyz: NDArray[np.float64]
-    position: NDArray[np.float64]
-
-    @staticmethod
-    def of(T_world_camera: Pose) -> "Placement":
-        """The rotation as a unit quaternion, w first, and the position in metres."""
-        wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
-        return Placement(wxyz, T_world_camera[:3, 3])
-
-    def pose(self) -> Pose:
-        """The pose as a (4, 4) matrix."""
-        T = np.eye(4)
-        T[:3, :3] = vtf.SO3(np.asarray(self.wxyz, np.float64)).as_matrix()
-        T[:3, 3] = self.position
-        return T
+def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A pose as viser takes it: the rotation as a unit quaternion, w first, and the position in metres."""
+    wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
+    return wxyz, T_world_camera[:3, 3]
 
 
 class ShownKeyframes:
@@ -117,9 +104,6 @@ class KeyframeLayer:
         self.gizmo: viser.TransformControlsHandle | None = None
         self.held = False
         """True while a user drags the gizmo."""
-        self._frusta: dict[int, viser.CameraFrustumHandle | viser.LineSegmentsHandle] = {}
-        self._on_spheres: dict[int, viser.PointCloudHandle] = {}
-        """The pictures of keyframes that have no frustum."""
         # viser remembers each name that was ever removed, so names are used again.
         self._places: dict[int, int] = {}
         self._free_places: list[int] = []
@@ -134,9 +118,8 @@ class KeyframeLayer:
         """Show a keyframe that is new or has changed."""
         forgotten = self.roster.put(keyframe)
         for id in forgotten:
-            self._take_off_picture(id)
-            del self._frusta[id]  # its node is the next one's
-            self._free_places.append(self._places.pop(id))
+            self._scene.remove_by_name(f"{self._name(id)}/picture")
+            self._free_places.append(self._places.pop(id))  # its node is the next one's
         if self.chosen in forgotten:
             self.release()
             self.chosen = min(self.keyframes)
@@ -149,14 +132,14 @@ class KeyframeLayer:
         """Mark a keyframe as the one that the buttons change."""
         before, self.chosen = self.chosen, id
         for each in (before, id):
-            if each in self._frusta:
+            if each in self._places:
                 self._draw(self.keyframes[each])
 
     def show_pictures(self, on: bool) -> None:
         """Show the depth images in the frusta, or hide them."""
         if on != self._pictures:
             self._pictures = on
-            for id in list(self._frusta):
+            for id in list(self._places):
                 self._draw(self.keyframes[id])
 
     def draw_way(self) -> None:
@@ -174,9 +157,9 @@ class KeyframeLayer:
         """Put a gizmo on the chosen keyframe. There must be one."""
         self.release()
         assert self.chosen is not None
-        place = Placement.of(self.keyframes[self.chosen].T_world_camera)
+        wxyz, position = placement(self.keyframes[self.chosen].T_world_camera)
         self.gizmo = self._scene.add_transform_controls(
-            "/gizmo", scale=0.5, depth_test=False, wxyz=place.wxyz, position=place.position
+            "/gizmo", scale=0.5, depth_test=False, wxyz=wxyz, position=position
         )
         return self.gizmo
 
@@ -194,16 +177,13 @@ class KeyframeLayer:
         if keyframe.state == "frozen":
             self.release()
             return
-        place = Placement.of(keyframe.T_world_camera)
-        self.gizmo.wxyz, self.gizmo.position = place.wxyz, place.position
+        self.gizmo.wxyz, self.gizmo.position = placement(keyframe.T_world_camera)
 
     def clear(self) -> None:
         """Remove all keyframes."""
         self.release()
-        for id, frustum in self._frusta.items():
-            self._take_off_picture(id)
-            frustum.remove()
-        self._frusta.clear()
+        for id in self._places:
+            self._scene.remove_by_name(self._name(id))
         self._places.clear()
         self._free_places.clear()
         self.roster = ShownKeyframes()
@@ -215,10 +195,10 @@ class KeyframeLayer:
         id, is_chosen = keyframe.id, keyframe.id == self.chosen
         if id not in self._places:
             self._places[id] = self._free_places.pop() if self._free_places else len(self._places)
-        name = f"/keyframes/{self._places[id]}"
+        name = self._name(id)
         picture = keyframe.picture if self._pictures and keyframe.state != "off" else None
         flat = isinstance(keyframe.camera, PinholeCamera)
-        self._frusta[id] = self._outline(
+        self._outline(
             name,
             keyframe.T_world_camera,
             keyframe.camera,
@@ -227,9 +207,9 @@ class KeyframeLayer:
             picture=picture if flat else None,
         )
         if flat or picture is None or picture.shape[:2] != keyframe.camera.shape:
-            self._take_off_picture(id)
+            self._scene.remove_by_name(f"{name}/picture")
         else:
-            self._on_spheres[id] = self._scene.add_point_cloud(
+            self._scene.add_point_cloud(
                 f"{name}/picture",
                 points=on_sphere(keyframe.camera, RING_M).reshape(-1, 3),
                 colors=picture.reshape(-1, 3),
@@ -238,9 +218,8 @@ class KeyframeLayer:
                 precision="float16",
             )
 
-    def _take_off_picture(self, id: int) -> None:
-        if id in self._on_spheres:
-            self._on_spheres.pop(id).remove()
+    def _name(self, id: int) -> str:
+        return f"/keyframes/{self._places[id]}"
 
     def _outline(
         self,
@@ -251,21 +230,22 @@ class KeyframeLayer:
         thickness: float,
         enlarged: float = 1.0,
         picture: NDArray[np.uint8] | None = None,
-    ) -> viser.CameraFrustumHandle | viser.LineSegmentsHandle:
-        """A frustum, or what a camera without a flat image sees on a sphere: rings."""
-        place = Placement.of(T_world_camera)
+    ) -> None:
+        """Draw a frustum, or what a camera without a flat image sees on a sphere: rings."""
+        wxyz, position = placement(T_world_camera)
         if not isinstance(camera, PinholeCamera):
-            return self._scene.add_line_segments(
+            self._scene.add_line_segments(
                 name,
                 border(camera, enlarged * RING_M),
                 color,
                 thickness=thickness,
                 thickness_units="screen",
-                wxyz=place.wxyz,
-                position=place.position,
+                wxyz=wxyz,
+                position=position,
             )
+            return
         fov, aspect = _view_angles(camera)
-        return self._scene.add_camera_frustum(
+        self._scene.add_camera_frustum(
             name,
             fov,
             aspect,
@@ -278,8 +258,8 @@ class KeyframeLayer:
             jpeg_quality=70,
             cast_shadow=False,
             receive_shadow=False,
-            wxyz=place.wxyz,
-            position=place.position,
+            wxyz=wxyz,
+            position=position,
         )
 
 
@@ -328,3 +308,97 @@ def hits_of_sphere(origin: ArrayLike, direction: ArrayLike, radius_m: float) -> 
         return []
     half = float(np.sqrt(under))
     return [t for t in (nearest - half, nearest + half) if t > 0]
+
+
+@dataclass(frozen=True)
+class Pixel:
+    """A pixel of a keyframe's picture, and its distance from the viewpoint in metres. ``point`` (3,), in the
+    world, is on the picture if that is not flat; its pixels are then not those of the keyframe's image."""
+
+    keyframe: int
+    u: float
+    v: float
+    range_m: float
+    point: NDArray[np.float64] | None = None
+
+
+def first_voxel(
+    origin: ArrayLike, direction: ArrayLike, centres: NDArray[np.float64], side_m: float
+) -> tuple[NDArray[np.float64], float] | None:
+    """The centre of the nearest voxel that a ray hits, and its range in metres, of those with these centres
+    (n, 3) and this side.
+
+    The ray hits a voxel if it passes the centre at no more than half the diagonal of a face: about the size
+    of the voxel's point on the screen.
+    """
+    start = np.asarray(origin, np.float64)
+    along = np.asarray(direction, np.float64)
+    along = along / np.linalg.norm(along)
+    offset = centres - start
+    range_m = offset @ along
+    aside = np.linalg.norm(offset - range_m[:, None] * along, axis=1)
+    met = np.flatnonzero((range_m > 0) & (aside <= np.sqrt(0.5) * side_m))
+    if not len(met):
+        return None
+    first = met[np.argmin(range_m[met])]
+    return centres[first], float(range_m[first])
+
+
+def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:
+    """The pixel that a ray hits first, of all pictures of keyframes."""
+    start = np.asarray(origin, np.float64)
+    along = np.asarray(direction, np.float64)
+    along = along / np.linalg.norm(along)
+    hits = [hit for keyframe in keyframes if (hit := _pixel(start, along, keyframe)) is not None]
+    return min(hits, key=lambda hit: hit.range_m, default=None)
+
+
+def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: KeyframeInfo) -> Pixel | None:
+    """The pixel where the ray crosses the picture, which stands FRUSTUM_M in front of the keyframe's
+    camera, or lies on a sphere of radius RING_M around it."""
+    R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
+    origin, direction = R.T @ (start - t), R.T @ along
+    if not isinstance(keyframe.camera, PinholeCamera):
+        return _pixel_on_sphere(keyframe, origin, direction)
+    if abs(direction[2]) < 1e-9:
+        return None
+    range_m = (FRUSTUM_M - origin[2]) / direction[2]
+    x, y = (origin + range_m * direction)[:2] / FRUSTUM_M
+    camera = keyframe.camera
+    u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
+    inside = -0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5
+    return Pixel(keyframe.id, float(u), float(v), float(range_m)) if inside and range_m > 0 else None
+
+
+def _pixel_on_sphere(
+    keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
+) -> Pixel | None:
+    """The nearer of the sphere's sides that has a pixel where the ray, in the camera frame, crosses it."""
+    if origins_of(keyframe.camera) is not None:
+        return _pixel_of_moving(keyframe, origin, direction)
+    for range_m in hits_of_sphere(origin, direction, RING_M):
+        point = origin + range_m * direction
+        u, v, _ = keyframe.camera.project(point[None])[0]
+        if not np.isnan(u):
+            R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
+            return Pixel(keyframe.id, float(u), float(v), range_m, R @ point + t)
+    return None
+
+
+def _pixel_of_moving(
+    keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
+) -> Pixel | None:
+    """The pixel that the ray, in the camera frame, passes at no more than about a pixel's width, on the
+    nearer side of what is a sphere if the camera does not move."""
+    points = on_sphere(keyframe.camera, RING_M).reshape(-1, 3).astype(np.float64)
+    range_m = (points - origin) @ direction
+    aside = np.linalg.norm(points - origin - range_m[:, None] * direction, axis=1)
+    width_m = RING_M * np.sqrt(4 * np.pi / len(points))
+    met = np.flatnonzero((range_m > 0) & (aside < width_m))
+    if not len(met):
+        return None
+    near = met[range_m[met] < range_m[met].min() + width_m]
+    best = int(near[np.argmin(aside[near])])
+    v, u = divmod(best, keyframe.camera.width)
+    R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
+    return Pixel(keyframe.id, float(u), float(v), float(range_m[best]), R @ points[best] + t)

@@ -15,8 +15,8 @@ from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
-from taichi_mrf.viewer.scene.voxel_layer import CutPlane, Look, VoxelLayer, cut_picture, look_of
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
+from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 
 UPDATES_PER_SECOND = 8
@@ -35,7 +35,6 @@ _SQUARES_ACROSS = 8
 
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 _OUTLINE_COLOR = (120, 120, 120)
-_OUTLINE_NODE = "/bricks"
 _GROUND_COLOR = (160, 165, 172)
 
 
@@ -53,10 +52,7 @@ class MapScene:
         self._surface_wanted = False
         self.growing = False
         """True while frames are read: a surface that was made before lacks what they add."""
-        self._cut_plane = CutPlane(server.scene, hello.voxel_size)
-        self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self.ground = Ground(server.scene)
-        self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
         self._all_dirty = True
         self._look: Look | None = None
         self._news_at = self._sent_at = 0.0
@@ -80,12 +76,8 @@ class MapScene:
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
-        corners = []
-        for layer in self.layers.values():
-            bounds = layer.store.bounds()
-            if bounds is not None:
-                ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
-                corners.append(ends + layer.origin_m)
+        ends = ((layer.ends_m(), layer.origin_m) for layer in self.layers.values())
+        corners = [end + origin_m for end, origin_m in ends if end is not None]
         if not corners:
             return None
         every = np.concatenate(corners)
@@ -106,15 +98,15 @@ class MapScene:
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
-        layer: Layer = "map" if bricks.layer == "dynamic" else bricks.layer
-        store = self.layers[layer].dynamic if bricks.layer == "dynamic" else self.layers[layer].store
-        changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
-        self._dirty[layer] |= changed
+        layer = self.layers["map" if bricks.layer == "dynamic" else bricks.layer]
+        store = layer.dynamic if bricks.layer == "dynamic" else layer.store
+        layer.changed |= store.put(bricks.bricks, log_odds=bricks.log_odds, seen=bricks.seen)
+        layer.changed |= store.remove(bricks.removed)
         self._news_at = time.monotonic()
 
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""
-        self._dirty["map"] |= self.store.paint(colors.bricks, colors.colors)
+        self.layers["map"].changed |= self.store.put(colors.bricks, colors=colors.colors)
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:
@@ -127,17 +119,19 @@ class MapScene:
         for layer in self.layers.values():
             layer.clear()
         self.surface.clear()
-        self._cut_plane.hide()
-        self._brick_lines.hide()
         self.ground.hide()
-        for name in _NAMES:
-            self._server.scene.remove_by_name(f"/names/{name}")
+        for name in ("/cut", "/bricks", *(f"/names/{layer}" for layer in _NAMES)):
+            self._server.scene.remove_by_name(name)
 
     def patience(self) -> float | None:
         """Seconds until :meth:`flush` has something to do if no update comes; None if it has nothing to
         do."""
         now = time.monotonic()
-        if self._all_dirty or any(self._dirty.values()) or (self.shows_surface and self.surface.is_stale):
+        if (
+            self._all_dirty
+            or any(layer.changed for layer in self.layers.values())
+            or (self.shows_surface and self.surface.is_stale)
+        ):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
         inexact = any(layer.inexact() for layer in self.layers.values())
         return max(0.0, self._news_at + REST_S - now) if inexact else None
@@ -162,12 +156,10 @@ class MapScene:
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
         self._surface_wanted = options.show == "surface"
-        map_changed = everything or bool(self._dirty["map"])
-        any_changed = map_changed or bool(self._dirty["baseline"])
-        for name, layer in self.layers.items():
-            chunks = layer.all_chunks() if everything else self._dirty[name]
-            layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
-            self._dirty[name] = set()
+        map_changed = everything or bool(self.layers["map"].changed)
+        any_changed = map_changed or bool(self.layers["baseline"].changed)
+        for layer in self.layers.values():
+            layer.prepare(look, everything, exactly=rested)
         if everything:
             self.surface.outdate()
         if self.shows_surface:
@@ -179,7 +171,7 @@ class MapScene:
             self._show_surface(self.shows_surface)
             if map_changed:
                 self._draw_cut(look, crossed)
-                self._brick_lines.show(self.store.bricks() if options.bricks else None)
+                self._draw_bricks(options.bricks)
                 self._show_space(options, up)
             if any_changed:
                 self.layers["baseline"].place(self._baseline_m(up))
@@ -207,13 +199,23 @@ class MapScene:
             self._server.scene.world_axes.visible = options.axes
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
+        hello, scene = self._hello, self._server.scene
         if look.cut is None:
-            self._cut_plane.hide()
+            scene.remove_by_name("/cut")
             return
-        picture = cut_picture(
-            self.store, look.cut, self._hello.prior_log_odds, self._hello.min_evidence, crossed
+        picture = cut_picture(self.store, look.cut, hello.prior_log_odds, hello.min_evidence, crossed)
+        show_cut(scene, hello.voxel_size, self.store, look.cut, picture)
+
+    def _draw_bricks(self, wanted: bool) -> None:
+        """Draw the outlines of the map's bricks if they are ``wanted``."""
+        bricks = self.store.bricks()
+        if not wanted or not len(bricks):
+            self._server.scene.remove_by_name("/bricks")
+            return
+        lines = (brick_edges(bricks) * BRICK * self._hello.voxel_size).astype(np.float32)
+        self._server.scene.add_line_segments(
+            "/bricks", lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
         )
-        self._cut_plane.show(self.store, look.cut, picture)
 
     def _draw_names(self, up: Up) -> None:
         """Put a label above each map if there are two."""
@@ -222,10 +224,9 @@ class MapScene:
             if not two:
                 self._server.scene.remove_by_name(f"/names/{layer}")
                 continue
-            bounds = self.layers[layer].store.bounds()
-            if bounds is None:
+            ends = self.layers[layer].ends_m()
+            if ends is None:
                 continue
-            ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
             above = ends.mean(axis=0) + self.layers[layer].origin_m
             axis, sign = up
             above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()
@@ -234,10 +235,10 @@ class MapScene:
     def _baseline_m(self, up: Up) -> NDArray[np.float64]:
         """The shift of the baseline's map, in metres: past the map, along a horizontal axis."""
         shift = np.zeros(3)
-        bounds = self.store.bounds()
-        if bounds is not None:
+        ends = self.layers["map"].ends_m()
+        if ends is not None:
             axis = 0 if up[0] != 0 else 1
-            shift[axis] = (bounds[1] - bounds[0] + 1)[axis] * BRICK * self._hello.voxel_size + _GAP_M
+            shift[axis] = ends[1, axis] - ends[0, axis] + _GAP_M
         return shift
 
 
@@ -256,30 +257,6 @@ def brick_edges(bricks: NDArray[np.int64]) -> NDArray[np.int64]:
     unique = np.unique(np.concatenate(edges), axis=0)
     start, axes = unique[:, :3], unique[:, 3]
     return np.stack([start, start + np.eye(3, dtype=np.int64)[axes]], axis=1)
-
-
-class BrickLines:
-    """Owns the lines in the scene."""
-
-    def __init__(self, scene: viser.SceneApi, voxel_size: float) -> None:
-        self._scene, self._voxel_size = scene, voxel_size
-        self._node: viser.LineSegmentsHandle | None = None
-
-    def show(self, bricks: NDArray[np.int64] | None) -> None:
-        """Draw the outlines of bricks (n, 3); no bricks, or None, remove them."""
-        if bricks is None or not len(bricks):
-            self.hide()
-            return
-        lines = (brick_edges(bricks) * BRICK * self._voxel_size).astype(np.float32)
-        self._node = self._scene.add_line_segments(
-            _OUTLINE_NODE, lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
-        )
-
-    def hide(self) -> None:
-        """Remove the lines from the scene."""
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
 
 
 def square_m(extent_m: float) -> float:

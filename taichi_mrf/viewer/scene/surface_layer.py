@@ -8,7 +8,6 @@ here beforehand; they are floats, because bright colours lie beyond 1.
 
 import json
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -33,12 +32,8 @@ _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """The mesh of a chunk: the vertices of its triangles (m, 3)."""
-
-    glb: bytes
-    triangles: NDArray[np.int32]
+_Mesh = tuple[NDArray[np.int32], bytes]
+"""The mesh of a chunk: the vertices of its triangles (m, 3), and its glTF."""
 
 
 class SurfaceLayer:
@@ -51,8 +46,9 @@ class SurfaceLayer:
         self._stale: set[ChunkKey] = set()
         self._view: SurfaceView | None = None
         self._scale: Scale | None = None
-        self._prepared: dict[ChunkKey, _Drawn | None] = {}
-        self._nodes: dict[ChunkKey, tuple[_Drawn, viser.GlbHandle]] = {}
+        self._prepared: dict[ChunkKey, _Mesh | None] = {}
+        self._shown: dict[ChunkKey, NDArray[np.int32]] = {}
+        """The triangles of each chunk that clients have."""
 
     @property
     def is_stale(self) -> bool:
@@ -67,9 +63,8 @@ class SurfaceLayer:
     @property
     def triangles_shown(self) -> int:
         """Number of triangles that clients show once everything prepared has been sent."""
-        ahead: dict[ChunkKey, _Drawn | None] = {key: drawn for key, (drawn, _) in self._nodes.items()}
-        ahead |= self._prepared
-        return sum(len(each.triangles) for each in ahead.values() if each is not None)
+        same = sum(len(shown) for key, shown in self._shown.items() if key not in self._prepared)
+        return same + sum(len(mesh[0]) for mesh in self._prepared.values() if mesh is not None)
 
     def take(self, patch: SurfacePatch) -> None:
         """Take in a changed patch."""
@@ -112,17 +107,16 @@ class SurfaceLayer:
 
     def send(self, visible: bool) -> None:
         """Send what was prepared, and show or hide it all."""
-        for key, drawn in self._prepared.items():
-            if drawn is not None:
-                name = f"{self._prefix}/{key[0]}_{key[1]}_{key[2]}"
-                self._nodes[key] = (
-                    drawn,
-                    self._scene.add_glb(
-                        name, drawn.glb, position=self._corner_m(key), cast_shadow=False, receive_shadow=False
-                    ),
+        for key, mesh in self._prepared.items():
+            name = f"{self._prefix}/{key[0]}_{key[1]}_{key[2]}"
+            if mesh is None:
+                self._shown.pop(key, None)
+                self._scene.remove_by_name(name)
+            else:
+                self._shown[key] = mesh[0]
+                self._scene.add_glb(
+                    name, mesh[1], position=self._corner_m(key), cast_shadow=False, receive_shadow=False
                 )
-            elif key in self._nodes:
-                self._nodes.pop(key)[1].remove()
         self._prepared.clear()
         if self._root.visible != visible:
             self._root.visible = visible
@@ -132,24 +126,24 @@ class SurfaceLayer:
         self.patches.clear()
         self._view = None
         self._stale.clear()
-        self._prepared = dict.fromkeys(self._nodes)
+        self._prepared = dict.fromkeys(self._shown)
         self.send(visible=False)
 
     def points(self) -> NDArray[np.float64]:
         """The vertices (n, 3) that are shown, in metres, world."""
         shown = [
-            self.patches[key].vertices_m[np.unique(drawn.triangles)]
-            for key, (drawn, _) in self._nodes.items()
+            self.patches[key].vertices_m[np.unique(triangles)]
+            for key, triangles in self._shown.items()
             if key in self.patches
         ]
         return np.concatenate([np.zeros((0, 3)), *shown])
 
-    def _drawn(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> _Drawn | None:
+    def _drawn(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> _Mesh | None:
         triangles = self._uncut(patch, look.cut)
         if not len(triangles):
             return None
         vertices = (patch.vertices_m - self._corner_m(patch.chunk)).astype(np.float32)
-        return _Drawn(unlit_glb(vertices, triangles, self._colors(patch, look, scale, store)), triangles)
+        return triangles, unlit_glb(vertices, triangles, self._colors(patch, look, scale, store))
 
     def _uncut(self, patch: SurfacePatch, cut: Cut | None) -> NDArray[np.int32]:
         """The triangles that are not cut away."""

@@ -24,7 +24,6 @@ OCCUPIED = (253, 200, 36, 230)
 UNKNOWN = (0, 0, 0, 0)
 
 _MOST_PIXELS = 2048
-_NODE = "/cut"
 
 # Local x, y and z of the picture (columns to the right, rows downwards, away from the reader) as the
 # world's axes, for a cut across x, y, z; each is a rotation by a third of a turn or none.
@@ -79,45 +78,34 @@ def cut_picture(
     return picture
 
 
-class CutPlane:
-    """Owns the picture in the scene."""
-
-    def __init__(self, scene: viser.SceneApi, voxel_size: float) -> None:
-        self._scene, self._voxel_size = scene, voxel_size
-        self._node: viser.ImageHandle | None = None
-
-    def show(self, store: VoxelStore, cut: Cut, picture: NDArray[np.uint8]) -> None:
-        """Show a :func:`cut_picture` in the plane of the cut."""
-        bounds = store.bounds()
-        assert bounds is not None
-        low_m = bounds[0] * BRICK * self._voxel_size
-        high_m = (bounds[1] + 1) * BRICK * self._voxel_size
-        centre = (low_m + high_m) / 2
-        centre[cut.axis] = (cut.voxel + 1) * self._voxel_size
-        columns, rows = _AXES[cut.axis]
-        shrink = -(-max(picture.shape[:2]) // _MOST_PIXELS)
-        if shrink == 1:  # so that the edges of voxels stay sharp when seen from near
-            grow = max(1, _MOST_PIXELS // (4 * max(picture.shape[:2])))
-            picture = cv2.resize(picture, None, fx=grow, fy=grow, interpolation=cv2.INTER_NEAREST)
-        else:
-            picture = np.ascontiguousarray(picture[::shrink, ::shrink])
-        self._node = self._scene.add_image(
-            _NODE,
-            picture,
-            float((high_m - low_m)[columns]),
-            float((high_m - low_m)[rows]),
-            format="png",
-            cast_shadow=False,
-            receive_shadow=False,
-            wxyz=_WXYZ[cut.axis],
-            position=centre,
-        )
-
-    def hide(self) -> None:
-        """Remove the picture from the scene."""
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
+def show_cut(
+    scene: viser.SceneApi, voxel_size: float, store: VoxelStore, cut: Cut, picture: NDArray[np.uint8]
+) -> None:
+    """Show a :func:`cut_picture` in the plane of the cut, as the scene node /cut."""
+    bounds = store.bounds()
+    assert bounds is not None
+    low_m = bounds[0] * BRICK * voxel_size
+    high_m = (bounds[1] + 1) * BRICK * voxel_size
+    centre = (low_m + high_m) / 2
+    centre[cut.axis] = (cut.voxel + 1) * voxel_size
+    columns, rows = _AXES[cut.axis]
+    shrink = -(-max(picture.shape[:2]) // _MOST_PIXELS)
+    if shrink == 1:  # so that the edges of voxels stay sharp when seen from near
+        grow = max(1, _MOST_PIXELS // (4 * max(picture.shape[:2])))
+        picture = cv2.resize(picture, None, fx=grow, fy=grow, interpolation=cv2.INTER_NEAREST)
+    else:
+        picture = np.ascontiguousarray(picture[::shrink, ::shrink])
+    scene.add_image(
+        "/cut",
+        picture,
+        float((high_m - low_m)[columns]),
+        float((high_m - low_m)[rows]),
+        format="png",
+        cast_shadow=False,
+        receive_shadow=False,
+        wxyz=_WXYZ[cut.axis],
+        position=centre,
+    )
 
 
 def _classes(log_odds: NDArray[np.floating], prior_log_odds: float, min_evidence: float) -> NDArray[np.uint8]:
@@ -175,6 +163,8 @@ class VoxelLayer:
     def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
         self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
         self.store, self.dynamic = VoxelStore(), VoxelStore()
+        self.changed: set[ChunkKey] = set()
+        """Chunks whose stores have changed since the last :meth:`prepare`."""
         self.origin_m = np.zeros(3)
         self.bytes_sent = 0
         self._sent: dict[ChunkKey, _Sent] = {}
@@ -191,17 +181,24 @@ class VoxelLayer:
         """How many of them have the colour of dynamic voxels."""
         return sum(each.dynamic for each in self._ahead())
 
+    def ends_m(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner (2, 3) in metres from the origin of the layer; None if it is empty."""
+        bounds = self.store.bounds()
+        return None if bounds is None else np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._voxel_size
+
     def place(self, origin_m: NDArray[np.float64]) -> None:
         """Move the whole layer to another origin, (3,) in metres, world."""
         self.origin_m = origin_m
         for key, node in self._nodes.items():
             node.position = self._position(key)
 
-    def prepare(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
-        """Find out what must be sent of some chunks; :meth:`send` sends it. Unless ``exactly``, small changes
-        of colour are left for later."""
-        for key in sorted(chunks):
+    def prepare(self, look: Look, everything: bool, exactly: bool) -> None:
+        """Find out what must be sent of chunks that have changed, or of ``everything``; :meth:`send` sends
+        it. Unless ``exactly``, small changes of colour are left for later."""
+        chunks = set(self.store.chunks) | set(self._sent) if everything else self.changed
+        for key in sorted(chunks | (self.inexact() if exactly else set())):
             self._prepare_chunk(key, look, exactly)
+        self.changed = set()
 
     def send(self) -> None:
         """Send what was prepared."""
@@ -215,10 +212,6 @@ class VoxelLayer:
     def inexact(self) -> set[ChunkKey]:
         """Chunks with small changes of colour that were left for later."""
         return {key for key, sent in self._sent.items() if not sent.exact}
-
-    def all_chunks(self) -> set[ChunkKey]:
-        """Every chunk that is in the store or in the scene."""
-        return set(self.store.chunks) | set(self._sent)
 
     def clear(self) -> None:
         """Remove everything from the scene and from the store."""

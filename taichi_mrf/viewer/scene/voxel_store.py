@@ -11,14 +11,23 @@ from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import Layer
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, offsets_in_brick
 
 ChunkKey = tuple[int, int, int]
 
 _IN_BRICK = offsets_in_brick().astype(np.uint8)
 _NOWHERE = -1
-_HIDDEN = np.int16(-32768)
 _BITS = VOXELS.bit_length() - 1
+
+_LAYERS = {
+    "log_odds": Layer(
+        "int16", 1, -32768, "log-odds in LOG_ODDS_STEP; where they are missing nothing is shown"
+    ),
+    "seen": Layer("uint8", 1, 0, "keyframes whose rays cross the voxel"),
+    "colors": Layer("uint8", 3, NO_COLOR, "red, green, blue that cameras saw"),
+}
+"""The layers of a map as they are sent to the page."""
 
 _CODES = np.stack(np.unravel_index(np.arange(CHUNK**3), (CHUNK,) * 3), axis=1).astype(np.uint8)
 _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
@@ -34,11 +43,6 @@ class Shown:
     log_odds: NDArray[np.int16]
     seen: NDArray[np.uint8]
     colors: NDArray[np.uint8] | None = None
-
-    def kept(self, which: NDArray[np.bool_]) -> "Shown":
-        """Some of them, ``which`` (n,)."""
-        colors = None if self.colors is None else self.colors[which]
-        return Shown(self.cells[which], self.log_odds[which], self.seen[which], colors)
 
 
 @dataclass(frozen=True)
@@ -72,9 +76,8 @@ class Chunk:
     def __init__(self) -> None:
         self._row = np.full(CHUNK**3, _NOWHERE, np.int16)
         self._codes = np.zeros(0, np.int16)
-        self.log_odds = np.zeros((0, VOXELS), np.int16)
-        self.seen = np.zeros((0, VOXELS), np.uint8)
-        self.colors: NDArray[np.uint8] | None = None  # (n, 512, 3), once some are known
+        self.values = {name: _missing(name, 0) for name in ("log_odds", "seen")}
+        """Values of the voxels by layer, (n, 512); colours once some are known, (n, 512, 3)."""
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -84,55 +87,45 @@ class Chunk:
         """Coordinates (n, 3) of the bricks in this chunk, 0..7."""
         return _CODES[self._codes].astype(np.int32)
 
-    def put(self, codes: NDArray[np.int16], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]) -> None:
-        """Set the voxels of some bricks, given by their numbers in the chunk."""
+    def put(self, codes: NDArray[np.int16], **values: NDArray) -> None:
+        """Set some layers of the voxels of some bricks, given by their numbers in the chunk. A brick that is
+        new is hidden until it has log-odds."""
         new = codes[self._row[codes] == _NOWHERE]
-        if len(new):
-            self._row[new] = np.arange(len(self), len(self) + len(new))
-            self._codes = np.concatenate([self._codes, new])
-            more = len(new), VOXELS
-            self.log_odds = np.concatenate([self.log_odds, np.zeros(more, np.int16)])
-            self.seen = np.concatenate([self.seen, np.zeros(more, np.uint8)])
-            if self.colors is not None:
-                self.colors = np.concatenate([self.colors, _uncolored(len(new))])
-        rows = self._row[codes]
-        self.log_odds[rows], self.seen[rows] = log_odds, seen
-
-    def paint(self, codes: NDArray[np.int16], colors: NDArray[np.uint8]) -> None:
-        """Set the colours of the voxels of some bricks. Those that are not here yet are hidden until
-        :meth:`put` brings their log-odds."""
-        new = codes[self._row[codes] == _NOWHERE]
-        self.put(new, np.full((len(new), VOXELS), _HIDDEN), np.zeros((len(new), VOXELS), np.uint8))
-        if self.colors is None:
-            self.colors = _uncolored(len(self))
-        self.colors[self._row[codes]] = colors
+        self._row[new] = np.arange(len(self), len(self) + len(new))
+        self._codes = np.concatenate([self._codes, new])
+        for name in self.values | values:
+            before = self.values.get(name, _missing(name, len(self) - len(new)))
+            if len(new):
+                before = np.concatenate([before, _missing(name, len(new))])
+            if name in values:
+                before[self._row[codes]] = values[name]
+            self.values[name] = before
 
     def remove(self, codes: NDArray[np.int16]) -> None:
         """Remove some bricks; numbers of other bricks are ignored."""
         keep = ~np.isin(self._codes, codes)
         self._codes = self._codes[keep]
-        self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
-        self.colors = None if self.colors is None else self.colors[keep]
+        self.values = {name: values[keep] for name, values in self.values.items()}
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
 
     def at_least(self, log_odds: float, hidden_above: tuple[int, int] | None = None) -> Shown:
         """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
         cell along that axis is at most that."""
-        voxels = np.flatnonzero(self.log_odds.reshape(-1) >= np.ceil(log_odds / LOG_ODDS_STEP))
+        every = {name: values.reshape(-1, *values.shape[2:]) for name, values in self.values.items()}
+        voxels = np.flatnonzero(every["log_odds"] >= np.ceil(log_odds / LOG_ODDS_STEP))
         cells = _CELLS[self._codes.astype(np.int32)[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
         if hidden_above is not None:
             kept = cells[:, hidden_above[0]] <= hidden_above[1]
             voxels, cells = voxels[kept], cells[kept]
-        colors = None if self.colors is None else self.colors.reshape(-1, 3)[voxels]
-        return Shown(cells, self.log_odds.reshape(-1)[voxels], self.seen.reshape(-1)[voxels], colors)
+        return Shown(cells, **{name: values[voxels] for name, values in every.items()})
 
     def seen_at(self, cells: NDArray[np.integer]) -> NDArray[np.uint8]:
         """By how many keyframes' rays the voxels with coordinates (n, 3), 0 to 63, were crossed, (n,)."""
         brick, local = cells // BRICK, cells % BRICK
         rows = self._row[(brick[:, 0] * CHUNK + brick[:, 1]) * CHUNK + brick[:, 2]]
         numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
-        return np.where(rows == _NOWHERE, 0, self.seen[rows, numbers]).astype(np.uint8)
+        return np.where(rows == _NOWHERE, 0, self.values["seen"][rows, numbers]).astype(np.uint8)
 
     def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
         """The log-odds of a voxel with coordinates (3,), 0 to 63, and the colour that cameras saw, None if it
@@ -141,9 +134,9 @@ class Chunk:
         if row == _NOWHERE:
             return None
         number = np.ravel_multi_index(tuple(cell % BRICK), (BRICK,) * 3)
-        color = None if self.colors is None else self.colors[row, number]
+        color = self.values["colors"][row, number] if "colors" in self.values else None
         seen = color is not None and (color != NO_COLOR).any()
-        return int(self.log_odds[row, number]), color if seen else None
+        return int(self.values["log_odds"][row, number]), color if seen else None
 
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
@@ -151,7 +144,7 @@ class Chunk:
         voxels = np.flatnonzero(_IN_BRICK[:, axis] == cell % BRICK)
         others = [other for other in range(3) if other != axis]
         cells = _CELLS.reshape(CHUNK**3, VOXELS, 3)[np.ix_(self._codes[rows], voxels)]
-        log_odds = self.log_odds[np.ix_(rows, voxels)]
+        log_odds = self.values["log_odds"][np.ix_(rows, voxels)]
         return cells[..., others].reshape(-1, 2).astype(np.int32), log_odds.reshape(-1)
 
 
@@ -162,23 +155,13 @@ class VoxelStore:
         self.chunks: dict[ChunkKey, Chunk] = {}
         self._bounds: dict[ChunkKey, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
 
-    def put(
-        self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
-    ) -> set[ChunkKey]:
-        """Take in bricks as :class:`messages.Bricks` brings them; returns the chunks that have changed."""
+    def put(self, bricks: NDArray[np.int32], **values: NDArray) -> set[ChunkKey]:
+        """Take in layers of bricks (n, 3) as :class:`messages.Bricks` and :class:`messages.BrickColors` bring
+        them; returns the chunks that have changed."""
         changed = set()
         for key, codes, rows in _by_chunk(bricks):
-            self.chunks.setdefault(key, Chunk()).put(codes, log_odds[rows], seen[rows])
-            changed.add(key)
-        self._forget_bounds(changed)
-        return changed
-
-    def paint(self, bricks: NDArray[np.int32], colors: NDArray[np.uint8]) -> set[ChunkKey]:
-        """Take in the colours (n, 512, 3) that cameras saw of bricks (n, 3); returns the chunks that have
-        changed."""
-        changed = set()
-        for key, codes, rows in _by_chunk(bricks):
-            self.chunks.setdefault(key, Chunk()).paint(codes, colors[rows])
+            found = {name: each[rows] for name, each in values.items()}
+            self.chunks.setdefault(key, Chunk()).put(codes, **found)
             changed.add(key)
         self._forget_bounds(changed)
         return changed
@@ -224,7 +207,7 @@ class VoxelStore:
 
     def most_seen(self) -> int:
         """The largest number of keyframes that see a voxel."""
-        return max((int(chunk.seen.max(initial=0)) for chunk in self.chunks.values()), default=0)
+        return max((int(chunk.values["seen"].max(initial=0)) for chunk in self.chunks.values()), default=0)
 
     def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
         """The voxels of a chunk with at least these log-odds that are not cut away; none if there is no such
@@ -238,8 +221,10 @@ class VoxelStore:
         return chunk.at_least(log_odds, hidden_above)
 
 
-def _uncolored(bricks: int) -> NDArray[np.uint8]:
-    return np.full((bricks, VOXELS, 3), NO_COLOR, np.uint8)
+def _missing(name: str, bricks: int) -> NDArray:
+    """Values of a layer of so many bricks of which nothing is known."""
+    layer = _LAYERS[name]
+    return np.full((bricks, VOXELS, *layer.shape), layer.missing, layer.dtype)
 
 
 def _by_chunk(

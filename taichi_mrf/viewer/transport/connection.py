@@ -9,18 +9,12 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
+from viser import _messages as theirs
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode
 from websockets.protocol import State
 
-from taichi_mrf.viewer.transport.client_messages import (
-    AnyClientMessage,
-    Camera,
-    Picture,
-    Undecodable,
-    WidgetUpdate,
-    encode,
-)
+from taichi_mrf.viewer.transport.client_messages import Undecodable, encode
 from taichi_mrf.viewer.transport.client_messages import decode as decode_message
 from taichi_mrf.viewer.transport.guard import Gate
 
@@ -74,11 +68,11 @@ class GuardedConnection(ServerConnection):
         super().__init__(*args, **options)
         self._budget = Budget(MESSAGES_PER_SECOND, MESSAGES_PER_SECOND, monotonic())
         self._reading: asyncio.Task[str | bytes] | None = None
-        self._held: dict[str, tuple[float, AnyClientMessage]] = {}
+        self._held: dict[str, tuple[float, theirs.Message]] = {}
         """Messages that are admitted later unless others replace them, with the time when they are due."""
         self._camera_due = 0.0
-        self._picture_begun = self._picture_arrived = False
         self._picture_bytes = 0
+        """Bytes that have come since a picture was asked for."""
 
     def data_received(self, data: bytes) -> None:
         """Take in bytes; a client whose next message is already too large loses its connection."""
@@ -114,33 +108,21 @@ class GuardedConnection(ServerConnection):
 
     def _is_within_size(self, received: int) -> bool:
         """True if the message that is arriving has not outgrown its bound, with the ``received`` bytes of it
-        or of those before it. A picture that was asked for may be large, once.
-
-        One read can end a message and begin the next, so the bytes of the picture are counted as well.
-        """
-        size = len(self.protocol.reader.buffer) + (self.protocol.current_size or 0)
-        if size <= LARGEST_MESSAGE and not self._picture_begun and not self._picture_arrived:
-            return True
+        or of those before it. While a picture is awaited, all that comes may be as large as one."""
         client_id = None if self.gate is None else self.gate.client_id(self)
-        if self.gate is None or client_id is None or not self.gate.awaits_picture(client_id):
-            self._picture_begun = self._picture_arrived = False
-            self._picture_bytes = 0
-            return size <= LARGEST_MESSAGE
-        if size <= LARGEST_MESSAGE:
-            self._picture_arrived |= self._picture_begun
-            self._picture_begun = False
-            return True
-        self._picture_bytes += received if self._picture_begun else size
-        self._picture_begun = True
-        return self._picture_bytes <= LARGEST_PICTURE and not self._picture_arrived
+        if self.gate is not None and client_id is not None and self.gate.awaits_picture(client_id):
+            self._picture_bytes += received
+            return self._picture_bytes <= LARGEST_PICTURE
+        self._picture_bytes = 0
+        return len(self.protocol.reader.buffer) + (self.protocol.current_size or 0) <= LARGEST_MESSAGE
 
-    def _due_message(self) -> AnyClientMessage | None:
+    def _due_message(self) -> theirs.Message | None:
         """A message that was held back and whose time has come."""
         now = monotonic()
         for key, (due, message) in self._held.items():
             if due <= now:
                 del self._held[key]
-                if isinstance(message, Camera):
+                if isinstance(message, theirs.ViewerCameraMessage):
                     self._camera_due = now + CAMERA_INTERVAL_S
                 return message
         return None
@@ -148,9 +130,8 @@ class GuardedConnection(ServerConnection):
     def _typed_is_complete(self) -> bool:
         """Release what is being typed, because the user now uses another widget; returns whether there was
         anything."""
-        typed = [key for key, (_, message) in self._held.items() if isinstance(message, WidgetUpdate)]
-        for key in typed:
-            self._held[key] = monotonic(), self._held[key][1]
+        typed = {key: message for key, (_, message) in self._held.items() if key != "camera"}
+        self._held |= {key: (monotonic(), message) for key, message in typed.items()}
         return bool(typed)
 
     def _patience_s(self) -> float | None:
@@ -173,7 +154,7 @@ class GuardedConnection(ServerConnection):
         reading, self._reading = self._reading, None
         return reading.result()
 
-    async def _understand(self, received: str | bytes) -> AnyClientMessage | None:
+    async def _understand(self, received: str | bytes) -> theirs.Message | None:
         """The message, unless it is refused or held back. Closes the connection if viser's client cannot
         have sent it."""
         if isinstance(received, str):
@@ -191,15 +172,15 @@ class GuardedConnection(ServerConnection):
         except Undecodable:
             await self.close(CloseCode.INVALID_DATA)
             return None
-        if message is None or (is_large and not isinstance(message, Picture)):
+        if message is None or (is_large and not isinstance(message, theirs.GetRenderResponseMessage)):
             return None
-        if isinstance(message, Camera):  # costs nothing: never more than one of them waits
+        if isinstance(message, theirs.ViewerCameraMessage):  # costs nothing: only one of them waits
             if self.gate.admit(client_id, message) is not None:
                 self._held["camera"] = self._camera_due, message
             return None
         if not self._budget.spend(monotonic()):
             return None
-        if isinstance(message, WidgetUpdate):
+        if isinstance(message, theirs.GuiUpdateMessage):
             self._held.pop(message.uuid, None)
             if self.gate.may_be_unfinished(client_id, message):
                 self._held[message.uuid] = monotonic() + TYPING_REST_S, message

@@ -1,8 +1,6 @@
 """Files that a browser gets from the page: pictures, standalone pages, recordings."""
 
-import base64
-import hashlib
-import re
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -14,8 +12,8 @@ import numpy as np
 import viser
 from viser.infra import StateSerializer
 
-from taichi_mrf.errors import ViewerError
-from taichi_mrf.viewer.transport.viser_internals import HERE, page_script_hashes
+from taichi_mrf.viewer.transport.origin import POLICY
+from taichi_mrf.viewer.transport.viser_internals import with_nonce
 
 PICTURE_TIMEOUT_S = 30.0
 """How long a browser may take to draw and send a picture."""
@@ -25,14 +23,6 @@ PICTURES_AT_ONCE = 8
 
 MOST_PIXELS = 2560 * 1600
 """Of a picture; larger windows are scaled down."""
-
-PAGE_POLICY = (
-    "default-src 'none'; script-src 'wasm-unsafe-eval' {scripts}; worker-src blob:; "
-    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:; "
-    "base-uri 'none'; form-action 'none'"
-)
-"""The file runs only viser's scripts, even if the scene holds text with scripts in it, and loads nothing from
-a network."""
 
 
 class Downloads:
@@ -75,8 +65,11 @@ class Downloads:
         """Give a browser the scene as one HTML file."""
         if self._begin(client, "page"):
             scene = self._server.get_scene_serializer()
-            self._later(
-                client, "page", lambda: self.send(client, "map.html", standalone_page(scene, dark).encode())
+            self._pool.submit(
+                self._finish,
+                client,
+                "page",
+                lambda: self.send(client, "map.html", standalone_page(scene, dark).encode()),
             )
 
     def toggle_recording(self, client: int) -> None:
@@ -132,14 +125,9 @@ class Downloads:
 
 
 def standalone_page(scene: StateSerializer, dark: bool) -> str:
-    """The HTML of a scene. Raises ViewerError if viser's page is not built as this package knows it."""
-    html = scene.as_html(dark)
-    begin, end = html.find("<script>window.__VISER_EMBED_DATA__="), html.find("</script></head>")
-    head = re.search(r"<head[^>]*>", html[: max(begin, 0)])
-    if head is None or begin > end:
-        raise ViewerError(f"cannot protect viser's standalone page: it has changed; mend {HERE}")
-    data = html[begin + len("<script>") : end].encode()
-    digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
-    policy = PAGE_POLICY.format(scripts=" ".join([*page_script_hashes(), f"'sha256-{digest}'"]))
+    """The HTML of a scene. It runs only viser's scripts, even if the scene holds text with scripts in it, and
+    loads nothing from a network. Raises ViewerError if viser's page is not built as this package knows it."""
+    nonce = secrets.token_urlsafe(16)
+    policy = POLICY.format(nonce=nonce, server="")
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-    return html[: head.end()] + meta + html[head.end() :]
+    return with_nonce(scene.as_html(dark), nonce).replace("<head>", f"<head>{meta}", 1)

@@ -8,29 +8,16 @@ range, on its grid.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
-import msgspec
 import viser
+from viser import _messages as theirs
 from viser.infra import ClientId
 from websockets.asyncio.server import ServerConnection
 
 from taichi_mrf.viewer.transport import viser_internals as internals
-from taichi_mrf.viewer.transport.client_messages import (
-    AnyClientMessage,
-    Camera,
-    Command,
-    GizmoGrab,
-    GizmoMove,
-    GizmoRelease,
-    NewValue,
-    NodeClick,
-    Picture,
-    SceneClick,
-    WidgetUpdate,
-    WidgetValue,
-)
 from taichi_mrf.viewer.transport.viser_internals import Widget
 
 SHORTEST_VECTOR = 1e-6
@@ -41,6 +28,9 @@ LONGEST_TEXT = 200
 
 LARGEST_NUMBER = 2**53
 """Beyond this a browser's numbers cannot hold every integer, and msgpack ends at 2^64."""
+
+MOST_PIXELS = 65536
+"""Along each side of a canvas."""
 
 Bounds = tuple[float | None, float | None]
 
@@ -60,94 +50,93 @@ class Gate:
         """True if a picture was asked of this client and has not arrived."""
         return internals.awaits_picture(self._server, client_id)
 
-    def may_be_unfinished(self, client_id: ClientId, message: AnyClientMessage) -> bool:
+    def may_be_unfinished(self, client_id: ClientId, message: theirs.GuiUpdateMessage) -> bool:
         """True if the message may be a number that is still being typed: one outside the range of its widget,
         as the 0 of 0.8 is, and any of a vector, each of whose values may move a keyframe."""
-        if not isinstance(message, WidgetUpdate):
-            return False
         widget = internals.input_widget(self._server, client_id, message.uuid)
         is_vector = isinstance(widget, viser.GuiVector2Handle | viser.GuiVector3Handle)
-        return is_vector or (widget is not None and is_out_of_range(widget, message.updates.value))
+        return is_vector or (widget is not None and is_out_of_range(widget, message.updates.get("value")))
 
-    def admit(self, client_id: ClientId, message: AnyClientMessage) -> AnyClientMessage | None:
+    def admit(self, client_id: ClientId, message: theirs.Message) -> theirs.Message | None:
         """The message as viser may have it; None if viser must not have it."""
         match message:
-            case Camera():
+            case theirs.ViewerCameraMessage():
                 return _tidy_camera(message)
-            case WidgetUpdate():
+            case theirs.GuiUpdateMessage():
                 return self._tidy_update(client_id, message)
-            case NodeClick():
+            case theirs.SceneNodeClickMessage():
                 scene = internals.scene_of(self._server, client_id, message.owner)
                 known = scene is not None and internals.node(scene, message.name) is not None
-                return _tidy_click(message) if known else None
-            case SceneClick():
-                return _tidy_click(message)
-            case GizmoMove() | GizmoGrab() | GizmoRelease():
-                return self._tidy_gizmo(client_id, message)
-            case Picture():
+                return _tidy_click(message) if known and (message.instance_index or 0) >= 0 else None
+            case theirs.ScenePointerMessage():
+                is_click = message.event_type == "click" and len(message.screen_pos) == 1
+                return _tidy_click(message) if is_click else None
+            case theirs.GetRenderResponseMessage():
                 return message if self.awaits_picture(client_id) else None
-            case Command():
+            case theirs.CommandTriggerMessage():
                 return message if internals.has_command(self._server, client_id, message.uuid) else None
+        return self._tidy_gizmo(client_id, message)
 
-    def _tidy_update(self, client_id: ClientId, message: WidgetUpdate) -> WidgetUpdate | None:
+    def _tidy_update(
+        self, client_id: ClientId, message: theirs.GuiUpdateMessage
+    ) -> theirs.GuiUpdateMessage | None:
         """The update with a value that its widget can have. If that is not what the client sent, the client
-        is told which value is in force."""
+        is told which value is in force. A client may write no other property of a widget."""
         widget = internals.input_widget(self._server, client_id, message.uuid)
-        if widget is None:
+        if widget is None or message.updates.keys() != {"value"}:
             return None
-        sent = message.updates.value
+        sent = message.updates["value"]
         value: Any = value_to_set(widget, sent)
         if value is not None and not internals.can_be_used(widget):
             value = None
         in_force = widget.value if value is None else value
         if not internals.is_button(widget) and not is_same(sent, in_force):
             internals.tell_value(self._server, client_id, message.uuid, in_force)
-        return None if value is None else WidgetUpdate(message.uuid, NewValue(value))
+        return None if value is None else theirs.GuiUpdateMessage(message.uuid, {"value": value})
 
-    def _tidy_gizmo(
-        self, client_id: ClientId, message: GizmoMove | GizmoGrab | GizmoRelease
-    ) -> GizmoMove | GizmoGrab | GizmoRelease | None:
+    def _tidy_gizmo(self, client_id: ClientId, message: Any) -> theirs.Message | None:
         """A gizmo that is shown may be used; one that is held may always be let go."""
         scene = internals.scene_of(self._server, client_id, message.owner)
         if scene is None:
             return None
-        if isinstance(message, GizmoRelease) and internals.holds_gizmo(scene, client_id, message.name):
+        is_release = isinstance(message, theirs.TransformControlsDragEndMessage)
+        if is_release and internals.holds_gizmo(scene, client_id, message.name):
             return message
         gizmo = internals.node(scene, message.name)
         if not isinstance(gizmo, viser.TransformControlsHandle) or not gizmo.visible:
             return None
-        if isinstance(message, GizmoMove):
+        if isinstance(message, theirs.TransformControlsUpdateMessage):
             wxyz = _unit(message.wxyz)
-            return None if wxyz is None else msgspec.structs.replace(message, wxyz=wxyz)
+            return None if wxyz is None else replace(message, wxyz=wxyz)
         return message
 
 
-def _unit(vector: tuple[float, ...]) -> Any:
+def _unit(vector: tuple[float, ...] | None) -> Any:
     """The vector or quaternion at length one; None if it has no direction."""
-    norm = math.hypot(*vector)
-    return None if norm < SHORTEST_VECTOR else tuple(component / norm for component in vector)
+    norm = math.hypot(*(vector or ()))
+    return None if vector is None or norm < SHORTEST_VECTOR else tuple(part / norm for part in vector)
 
 
-def _tidy_camera(message: Camera) -> Camera | None:
+def _tidy_camera(message: theirs.ViewerCameraMessage) -> theirs.ViewerCameraMessage | None:
     """A canvas that is folded away has no pixels; viser divides by their number."""
     wxyz, up_direction = _unit(message.wxyz), _unit(message.up_direction)
-    if wxyz is None or up_direction is None or message.far <= message.near:
+    sides = message.image_height, message.image_width
+    is_possible = 0 < message.fov < math.pi and 0 < message.near < message.far
+    is_possible &= 0 <= min(sides) <= max(sides) <= MOST_PIXELS
+    if wxyz is None or up_direction is None or not is_possible:
         return None
-    return msgspec.structs.replace(
-        message,
-        wxyz=wxyz,
-        up_direction=up_direction,
-        image_height=max(message.image_height, 1),
-        image_width=max(message.image_width, 1),
-    )
+    height, width = (max(side, 1) for side in sides)
+    return replace(message, wxyz=wxyz, up_direction=up_direction, image_height=height, image_width=width)
 
 
-def _tidy_click(message: NodeClick | SceneClick) -> NodeClick | SceneClick | None:
+def _tidy_click(message: theirs.SceneNodeClickMessage | theirs.ScenePointerMessage) -> theirs.Message | None:
     ray_direction = _unit(message.ray_direction)
-    return None if ray_direction is None else msgspec.structs.replace(message, ray_direction=ray_direction)
+    if ray_direction is None or message.ray_origin is None:
+        return None
+    return replace(message, ray_direction=ray_direction)
 
 
-def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
+def value_to_set(widget: Widget, sent: Any) -> Any | None:
     """The value that ``widget`` takes when ``sent`` arrives; None if it must not change.
 
     Numbers are clamped and rounded, text is cut; a value of the wrong type, a choice that is not offered
@@ -163,7 +152,7 @@ def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
         case viser.GuiTextHandle():
             return sent[:LONGEST_TEXT] if isinstance(sent, str) else None
         case viser.GuiSliderHandle():
-            return _slider_value(widget, sent) if _is_number(sent) else None
+            return _on_grid(sent, widget.min, widget, widget.value) if _is_number(sent) else None
         case viser.GuiNumberHandle():
             return _field_value(widget, sent, (widget.min, widget.max), widget.value)
         case viser.GuiMultiSliderHandle():
@@ -176,11 +165,10 @@ def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
     return None
 
 
-def is_out_of_range(widget: Widget, sent: WidgetValue) -> bool:
+def is_out_of_range(widget: Widget, sent: Any) -> bool:
     """True if ``sent`` is a number that the slider or field cannot show."""
     if not isinstance(widget, viser.GuiSliderHandle | viser.GuiNumberHandle) or not _is_number(sent):
         return False
-    assert isinstance(sent, int | float)
     return _clamp(sent, (widget.min, widget.max)) != sent
 
 
@@ -197,7 +185,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _numbers(sent: WidgetValue, count: int) -> Sequence[float] | None:
+def _numbers(sent: Any, count: int) -> Sequence[float] | None:
     """``sent`` if it is a list of ``count`` finite numbers."""
     if isinstance(sent, list) and len(sent) == count and all(map(_is_number, sent)):
         return sent
@@ -223,11 +211,7 @@ def _on_grid(value: float, origin: float, widget: Any, current: float) -> float:
     return type(current)(value)
 
 
-def _slider_value(widget: viser.GuiSliderHandle, sent: Any) -> float:
-    return _on_grid(sent, widget.min, widget, widget.value)
-
-
-def _multi_slider_value(widget: viser.GuiMultiSliderHandle, sent: WidgetValue) -> tuple[float, ...] | None:
+def _multi_slider_value(widget: viser.GuiMultiSliderHandle, sent: Any) -> tuple[float, ...] | None:
     """Handles in ascending order; the client counts the steps of this widget from zero."""
     numbers = _numbers(sent, len(widget.value))
     if numbers is None:
@@ -252,7 +236,7 @@ def _field_value(widget: Any, sent: Any, bounds: Bounds, current: float) -> floa
 
 
 def _vector_value(
-    widget: viser.GuiVector2Handle | viser.GuiVector3Handle, sent: WidgetValue
+    widget: viser.GuiVector2Handle | viser.GuiVector3Handle, sent: Any
 ) -> tuple[float, ...] | None:
     numbers = _numbers(sent, len(widget.value))
     if numbers is None:

@@ -9,9 +9,9 @@ import gzip
 import http
 import ipaddress
 import re
+import secrets
 import socket
 from collections.abc import Callable
-from functools import cache
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection
@@ -19,23 +19,23 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from taichi_mrf.viewer.transport import pulse
-from taichi_mrf.viewer.transport.viser_internals import page_script_hashes
+from taichi_mrf.viewer.transport.viser_internals import with_nonce
 
 PAGE_HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff"}
 """No other page may hold this one in a frame, and no browser may guess the type of a file."""
 
 POLICY = (
-    "default-src 'none'; script-src 'wasm-unsafe-eval' {scripts}; worker-src blob:; "
-    "style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'wasm-unsafe-eval' 'nonce-{nonce}'; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src {server} data: blob:; font-src data:; "
+    "connect-src {server} data: blob:; base-uri 'none'; form-action 'none'"
 )
 """The content security policy: the page runs its own scripts and no others, whatever texts it shows, and
-talks to this server alone."""
+talks to this server alone. The scripts have a nonce that is made for each answer."""
 
 Pages = Callable[[ServerConnection, Request], Response | None]
 """Serves the client's files; None if the request is for a websocket."""
 
-TAB_TITLE = b"<title>taichi_mrf</title>"
+TAB_TITLE = "<title>taichi_mrf</title>"
 
 DEFAULT_PORTS = {"http": 80, "https": 443}
 
@@ -111,20 +111,23 @@ def answer_page(connection: ServerConnection, request: Request, pages: Pages) ->
             return None
     else:
         response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
+    nonce = secrets.token_urlsafe(16)
     if response.headers.get("Content-Type", "").startswith("text/html"):
-        response.body = _made_ours(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+        response.body = _made_ours(
+            bytes(response.body), nonce, response.headers.get("Content-Encoding") == "gzip"
+        )
         del response.headers["Content-Length"]
         response.headers["Content-Length"] = str(len(response.body))
-    policy = POLICY.format(scripts=" ".join([*page_script_hashes(), pulse.SOURCE]))
+    policy = POLICY.format(nonce=nonce, server="'self'") + "; frame-ancestors 'none'"
     for name, value in {**PAGE_HEADERS, "Content-Security-Policy": policy}.items():
         response.headers[name] = value
     return response
 
 
-@cache
-def _made_ours(page: bytes, packed: bool) -> bytes:
+def _made_ours(page: bytes, nonce: str, packed: bool) -> bytes:
     """viser's page with the project's name on the browser's tab and the script that asks for the server's
     pulse, compressed again if it is ``packed``."""
-    plain = gzip.decompress(page) if packed else page
-    ours = plain.replace(b"<title>Viser</title>", TAB_TITLE + pulse.TAG, 1)
+    plain = (gzip.decompress(page) if packed else page).decode()
+    plain = plain.replace("<title>Viser</title>", TAB_TITLE + pulse.TAG, 1)
+    ours = with_nonce(plain, nonce).encode()
     return gzip.compress(ours) if packed else ours

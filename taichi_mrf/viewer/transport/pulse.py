@@ -7,8 +7,6 @@ answer, and hides what the panel says is being done. It lets the client connect 
 and reloads the page of a server that answers while the socket stays closed.
 """
 
-import base64
-import hashlib
 import http
 import json
 from pathlib import Path
@@ -83,10 +81,7 @@ document.addEventListener("visibilitychange", () => {  // timers of a hidden pag
 ).replace("ACTIVITY", ACTIVITY)
 """Runs before viser's own scripts."""
 
-TAG = f"<script>{SCRIPT}</script>".encode()
-
-SOURCE = f"'sha256-{base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()}'"
-"""The script as a source of a content security policy."""
+TAG = f"<script>{SCRIPT}</script>"
 
 
 class Pulse:

@@ -49,7 +49,7 @@ def start_server(host: str, port: int, title: str, pulse: Pulse | None = None) -
     Raises ViewerError if ``host`` is not an address of this machine, if no port is free, and if viser is
     not the version that this guard was written for.
     """
-    internals.page_script_hashes()
+    internals.with_nonce(internals.PAGE.read_text("utf-8"), nonce="")
     listener = _listen(host, port)
     door = _Door(listener, host, pulse or Pulse())
     try:

@@ -5,10 +5,7 @@ keeps for itself. :func:`changes_in` compares it with what this file was written
 start if they differ; ``tests/viewer/test_viser_internals.py`` says what to mend.
 """
 
-import base64
-import hashlib
 import operator
-import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,11 +14,9 @@ from pathlib import Path
 from types import MethodType, SimpleNamespace
 from typing import Any, get_type_hints
 
-import numpy as np
 import rich
 import viser
 import websockets.asyncio.server
-import zstandard
 from viser._assignable_props_api import AssignablePropsBase
 from viser._gui_handles import GuiModalHandle, _GuiInputHandle
 from viser._messages import (
@@ -38,6 +33,9 @@ from taichi_mrf.errors import ViewerError
 
 HERE = "taichi_mrf/viewer/transport/viser_internals.py"
 KNOWN_VERSION = "1.1"
+
+PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
+"""viser's page."""
 
 Widget = _GuiInputHandle[Any]
 """A widget with a value; clients may not write all of them."""
@@ -57,23 +55,11 @@ SERVER: dict[str, type] = {
 }
 """Attributes that are read of a server, and their types."""
 
-WIDGET: dict[str, type] = {
-    "_impl.gui_api": viser.GuiApi,
-    "_impl.parent_container_id": str,
-    "_impl.is_button": bool,
-    "_impl.uuid": str,
-    "_impl.props": object,
-}
-"""Attributes that are read of a widget."""
-
-CLIENT: dict[str, type] = {"_websock_connection._incoming_handlers": dict}
-"""Attributes that are read of a client."""
-
-TAB: dict[str, type] = {"_parent": viser.GuiTabGroupHandle}
-"""Attributes that are read of a tab."""
-
 _PATCHING = threading.RLock()
 """Held while something that viser uses is replaced."""
+
+_STARTS_SCRIPT = 'e.type="module"'
+"""Part of viser's page that starts the script that it has unpacked."""
 
 
 def changes_in(thing: Any, expected: Mapping[str, type]) -> list[str]:
@@ -190,43 +176,17 @@ def holds_gizmo(scene: viser.SceneApi, client: int, name: str) -> bool:
     return (ClientId(client), name) in scene._active_transform_drag_handles
 
 
-@cache
-def page_script_hashes() -> tuple[str, ...]:
-    """The scripts of viser's page as sources of a content security policy: the one in the file, and the one
-    that it unpacks and starts. Raises ViewerError if the page is packed in another way than is known here."""
-    path = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    try:
-        page = path.read_text("utf-8")
-        (head, outer) = re.findall(r"<script([^>]*)>(.*?)</script>", page, re.DOTALL)[0]
-        packed, styles, code = re.fullmatch(
-            r' data-p="([^"]*)" data-ss="(\d+)" data-cs="(\d+)"', head
-        ).groups()  # type: ignore[union-attr]
-        alphabet = re.search(r'const A="((?:[^"\\]|\\.)*)"', outer)[1].replace("\\\\", "\\")  # type: ignore[index]
-        unpacked = zstandard.ZstdDecompressor().decompress(
-            _from_text(packed, alphabet), max_output_size=int(styles) + int(code)
-        )
-    except (OSError, LookupError, ValueError, AttributeError, TypeError, zstandard.ZstdError) as error:
+def with_nonce(page: str, nonce: str) -> str:
+    """viser's page, whose scripts run under a content security policy that names ``nonce``: those in the
+    file, and the one that viser unpacks and starts. Raises ViewerError if viser starts it in another way than
+    is known here."""
+    if page.count(_STARTS_SCRIPT) != 1 or page.count("<head>") != 1:
         raise ViewerError(
-            f"cannot guard viser {viser.__version__}: its page is packed in another way ({error}); "
-            f"install viser {KNOWN_VERSION}, or mend page_script_hashes in {HERE}"
-        ) from error
-    inner = unpacked[int(styles) : int(styles) + int(code)]
-    digests = (hashlib.sha256(script).digest() for script in (outer.encode(), inner))
-    return tuple(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-
-
-def _from_text(packed: str, alphabet: str) -> bytes:
-    """Bytes that were written as digits to the base of the alphabet's length, five for each four bytes."""
-    value_of = np.zeros(128, np.int64)
-    value_of[[ord(c) for c in alphabet]] = np.arange(len(alphabet))
-    digits = value_of[np.frombuffer(packed.encode("ascii"), np.uint8)]
-    whole, rest = divmod(len(digits), 5)
-    powers = np.array([len(alphabet) ** k for k in (4, 3, 2, 1, 0)])
-    words = (digits[: 5 * whole].reshape(whole, 5) @ powers).astype(">u4").tobytes()
-    last = 0
-    for digit in digits[5 * whole :].tolist():
-        last = last * len(alphabet) + digit
-    return words + last.to_bytes(rest - 1, "big") if rest else words
+            f"cannot guard viser {viser.__version__}: its page is packed in another way; "
+            f"install viser {KNOWN_VERSION}, or mend with_nonce in {HERE}"
+        )
+    page = page.replace("<script", f'<script nonce="{nonce}"')
+    return page.replace(_STARTS_SCRIPT, f'e.nonce="{nonce}";{_STARTS_SCRIPT}')
 
 
 @contextmanager
@@ -234,31 +194,34 @@ def serving_by(serve: Callable[..., Any]) -> Iterator[None]:
     """viser finds ``serve`` in place of websockets' function of this name, and prints nothing; other modules
     and threads are not affected."""
     server_module = SimpleNamespace(**vars(websockets.asyncio.server) | {"serve": serve})
-    with _PATCHING, muted(threading.current_thread()):
-        original = viser_infra.websockets
-        stand_in = SimpleNamespace(**vars(original) | {"asyncio": SimpleNamespace(server=server_module)})
-        viser_infra.websockets = stand_in  # type: ignore[assignment]
-        try:
-            yield
-        finally:
-            viser_infra.websockets = original
+    stand_in = SimpleNamespace(**vars(websockets) | {"asyncio": SimpleNamespace(server=server_module)})
+    with muted(threading.current_thread()), _replaced(viser_infra, "websockets", stand_in):
+        yield
 
 
 @contextmanager
 def muted(thread: threading.Thread | None) -> Iterator[None]:
     """Drop what ``thread`` prints through rich.print; viser has no switch for some of it."""
+    original = rich.print
+
+    def print_for_others(*args: Any, **options: Any) -> None:
+        if threading.current_thread() is not thread:
+            original(*args, **options)
+
+    with _replaced(rich, "print", print_for_others):
+        yield
+
+
+@contextmanager
+def _replaced(module: Any, name: str, stand_in: Any) -> Iterator[None]:
+    """Replace something that viser uses, in one thread at a time."""
     with _PATCHING:
-        original = rich.print
-
-        def print_for_others(*args: Any, **options: Any) -> None:
-            if threading.current_thread() is not thread:
-                original(*args, **options)
-
-        rich.print = print_for_others
+        original = getattr(module, name)
+        setattr(module, name, stand_in)
         try:
             yield
         finally:
-            rich.print = original
+            setattr(module, name, original)
 
 
 @cache

@@ -12,6 +12,7 @@ import typing
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 from taichi_mrf.config.method import Method, Range, Slider, always
@@ -37,9 +38,7 @@ class Parameter:
 
     def value_of(self, config: Config) -> Any:
         """Value of the parameter; a coefficient beyond the polynomial's last is 0."""
-        value: Any = config
-        for field in self.path:
-            value = getattr(value, field)
+        value: Any = attrgetter(".".join(self.path))(config)
         if self.coefficient is None:
             return value
         return value[self.coefficient] if self.coefficient < len(value) else 0.0
@@ -151,12 +150,8 @@ def _knobs_of(method: Method) -> list[Knob]:
     ]
 
 
-def _has_no_sigma_table(config: Config) -> bool:
-    return config.sensor.sigma_table is None
-
-
-def _has_no_bias_table(config: Config) -> bool:
-    return config.sensor.bias_table is None
+def _has_no_table(of: str) -> Callable[[Config], bool]:
+    return lambda config: getattr(config.sensor, f"{of}_table") is None
 
 
 KNOBS = (
@@ -165,11 +160,11 @@ KNOBS = (
     *(knob for method in METHODS.values() for knob in _knobs_of(method)),
     Knob("keyframes.rotation", "keyframes", Range(0.0, 1.0, 0.01), "rad"),
     Knob("keyframes.translation", "keyframes", Range(0.0, 2.0, 0.02), "m"),
-    Knob("sensor.sigma[0]", "sensor", Range(0.0, 0.1, 0.0005), "m", counts=_has_no_sigma_table),
-    Knob("sensor.sigma[1]", "sensor", Range(-0.05, 0.05, 0.0005), counts=_has_no_sigma_table),
-    Knob("sensor.sigma[2]", "sensor", Range(-0.01, 0.05, 0.0001), "per m", counts=_has_no_sigma_table),
-    Knob("sensor.bias[0]", "sensor", Range(-0.1, 0.1, 0.0005), "m", counts=_has_no_bias_table),
-    Knob("sensor.bias[1]", "sensor", Range(-0.05, 0.05, 0.0005), counts=_has_no_bias_table),
-    Knob("sensor.bias[2]", "sensor", Range(-0.02, 0.02, 0.0005), "per m", counts=_has_no_bias_table),
+    Knob("sensor.sigma[0]", "sensor", Range(0.0, 0.1, 0.0005), "m", counts=_has_no_table("sigma")),
+    Knob("sensor.sigma[1]", "sensor", Range(-0.05, 0.05, 0.0005), counts=_has_no_table("sigma")),
+    Knob("sensor.sigma[2]", "sensor", Range(-0.01, 0.05, 0.0001), "per m", counts=_has_no_table("sigma")),
+    Knob("sensor.bias[0]", "sensor", Range(-0.1, 0.1, 0.0005), "m", counts=_has_no_table("bias")),
+    Knob("sensor.bias[1]", "sensor", Range(-0.05, 0.05, 0.0005), counts=_has_no_table("bias")),
+    Knob("sensor.bias[2]", "sensor", Range(-0.02, 0.02, 0.0005), "per m", counts=_has_no_table("bias")),
 )
 """In the order of the page. A method's own section is shown only while that method is chosen."""

@@ -13,9 +13,9 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_page import BasePage
-from taichi_mrf.viewer.transport.process import Inbox
+from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.tune import messages as t
-from taichi_mrf.viewer.tune.panel import Action, KnobMoved, TunePanel
+from taichi_mrf.viewer.tune.panel import KnobMoved, TunePanel
 
 
 class TunePage(BasePage[TunePanel]):
@@ -49,13 +49,13 @@ class TunePage(BasePage[TunePanel]):
             KnobMoved: lambda moved: self._knob_moved(moved.name),
         }
         self.actions |= {
-            Action.STOP_SEARCH: lambda client: ask(t.StopSearch()),
-            Action.USE_FRAMES: lambda client: self._choose_frames(),
-            Action.CHOOSE_VIEW: lambda client: self._look_at(self.panel.view.value),
-            Action.RESTORE: lambda client: self._with_try(self._restore),
-            Action.PIN: lambda client: self._with_try(lambda number: ask(t.Pin(number))),
-            Action.SAVE_YAML: lambda client: self._with_try(lambda n: ask(t.SaveTries("yaml", n, client))),
-            Action.SAVE_CSV: lambda client: self._with_try(lambda n: ask(t.SaveTries("csv", n, client))),
+            "Stop the search": lambda client: ask(t.StopSearch()),
+            "Use these frames": lambda client: self._choose_frames(),
+            "Held-out view": lambda client: self._look_at(self.panel.view.value),
+            "Restore": lambda client: self._with_try(self._restore),
+            "Pin": lambda client: self._with_try(lambda number: ask(t.Pin(number))),
+            "Save YAML": lambda client: self._with_try(lambda n: ask(t.SaveTries("yaml", n, client))),
+            "Save CSV": lambda client: self._with_try(lambda n: ask(t.SaveTries("csv", n, client))),
         }
 
     def batch_done(self) -> None:

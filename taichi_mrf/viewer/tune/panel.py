@@ -4,11 +4,10 @@ what they do.
 A slider has steps and the configuration has not: only the widget that a user has moved changes its parameter.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
+from operator import attrgetter
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,25 +16,12 @@ import viser
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ViewOptions
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
+from taichi_mrf.viewer.scene.coloring import OF_BELIEFS
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, in_html, in_markdown
-from taichi_mrf.viewer.transport.process import Event
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
-
-
-class Action(Enum):
-    """A button, or a widget whose value asks the tuning process for something."""
-
-    STOP_SEARCH = auto()
-    USE_FRAMES = auto()
-    CHOOSE_VIEW = auto()
-    RESTORE = auto()
-    PIN = auto()
-    SAVE_YAML = auto()
-    SAVE_CSV = auto()
 
 
 @dataclass(frozen=True)
@@ -45,14 +31,10 @@ class KnobMoved(Event):
     name: str
 
 
-TRY_BUTTONS = {"Restore": Action.RESTORE, "Pin": Action.PIN}
 SAVE_BUTTONS = {
-    "Save YAML": (
-        Action.SAVE_YAML,
-        "The parameters of the selected try, with its scores as a comment: for `map --config` and `live "
-        "--config`.",
-    ),
-    "Save CSV": (Action.SAVE_CSV, "The table of all tries with their parameters and scores."),
+    "Save YAML": "The parameters of the selected try, with its scores as a comment: for `map --config` and "
+    "`live --config`.",
+    "Save CSV": "The table of all tries with their parameters and scores.",
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
@@ -84,9 +66,9 @@ class TunePanel(BasePanel):
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
         self._last_shown: int | None = None
-        self._knobs: list[KnobWidgets] = []
+        self._knobs = KnobWidgets(gui, config, lambda name: tell(KnobMoved(name)))
         self._folders: dict[str, Any] = {}
-        self._stop = self.add_button("Stop the search", Action.STOP_SEARCH, visible=False)
+        self._stop = self.add_button("Stop the search", visible=False)
         self.add_counts()
         self._scores = gui.add_html("")
         tabs = gui.add_tab_group()
@@ -95,32 +77,27 @@ class TunePanel(BasePanel):
                 folder = gui.add_folder(title, expand_by_default=section not in _FOLDED)
                 self._folders[section] = folder
                 with folder:
-                    self._add_knobs(section, config)
+                    self._knobs.add(section)
         with tabs.add_tab("Noise", viser.Icon.CHART_DOTS):
             self.noise = NoisePlot(gui)
-            self._add_knobs("sensor", config)
+            self._knobs.add("sensor")
         with tabs.add_tab("Views", viser.Icon.PHOTO):
             self._views_tab()
         with tabs.add_tab("Tries", viser.Icon.HISTORY):
             self._tries_tab()
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self.add_legend()
-            self._options = OptionWidgets(gui, ViewOptions(), self.options_moved)
-            self._options.add(*MAP_OPTIONS)
-            self._options.offer("color_by", OF_BELIEFS)
+            self.view_options.add(*MAP_OPTIONS)
+            self.view_options.offer("color_by", OF_BELIEFS)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
             self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
             self._frames.add()
             hint = "Start again with these frames. The table of tries is emptied."
-            self.add_button("Use these frames", Action.USE_FRAMES, hint)
+            self.add_button("Use these frames", hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._about = gui.add_html("")
             self.add_notices()
-
-    def options(self) -> ViewOptions:
-        """The view options as the widgets stand."""
-        return self._options.value()
 
     def frame_choice(self) -> FrameChoice:
         """The working set as the widgets have it. Raises ConfigError."""
@@ -128,18 +105,16 @@ class TunePanel(BasePanel):
 
     def applied(self, name: str, config: Config) -> Config:
         """The configuration with one parameter as its widget stands. Raises ConfigError."""
-        return next(each for each in self._knobs if name in each).applied(name, config)
+        return self._knobs.applied(name, config)
 
     def show_config(self, config: Config) -> None:
         """Set all sliders and boxes, and the curves of the noise plot."""
-        for each in self._knobs:
-            each.show(config)
+        self._knobs.show(config)
         self.follow(config)
 
     def follow(self, config: Config) -> None:
         """Show what belongs to a configuration: its method's sliders, its noise curves."""
-        for each in self._knobs:
-            each.follow(config)
+        self._knobs.follow(config)
         for section in _OWN:
             folder, visible = self._folders[section], METHODS[config.method].section == section
             if folder.visible != visible:
@@ -211,16 +186,10 @@ class TunePanel(BasePanel):
             f"**A** · reference, {in_markdown(view.reference_title)}" if view.reference is not None else ""
         )
 
-    def _add_knobs(self, section: str, config: Config) -> None:
-        knobs = [knob for knob in KNOBS if knob.section == section]
-        self._knobs.append(KnobWidgets(self.gui, knobs, config, lambda name: self._tell(KnobMoved(name))))
-
     def _views_tab(self) -> None:
         gui = self.gui
-        self.view: Any = gui.add_dropdown(
-            "Held-out view", [NONE_YET], hint="A frame that is not in the map and scores it."
-        )
-        self.watch(self.view, Action.CHOOSE_VIEW)
+        hint = "A frame that is not in the map and scores it."
+        self.view = self.watch(gui.add_dropdown("Held-out view", [NONE_YET], hint=hint))
         gui.add_markdown("Right (blue), wrong (orange), no surface (light), not judged (dark).")
         black = np.zeros((2, 2, 3), np.uint8)
         self._reference_text = gui.add_markdown("")
@@ -237,9 +206,9 @@ class TunePanel(BasePanel):
         self.attempt: Any = gui.add_dropdown(
             "Selected try", [NONE_YET], hint="The try that the buttons use, with what it changed."
         )
-        self.add_buttons("Try", TRY_BUTTONS)
-        for name, (action, hint) in SAVE_BUTTONS.items():
-            self.add_button(name, action, hint)
+        self.add_buttons("Try", ("Restore", "Pin"))
+        for name, hint in SAVE_BUTTONS.items():
+            self.add_button(name, hint)
         gui.add_markdown(
             "**Restore** sets the sliders to the selected try and maps with it again. **Pin** makes it the "
             "reference (A): scores and pictures of other tries are compared with it."
@@ -247,28 +216,27 @@ class TunePanel(BasePanel):
 
 
 class KnobWidgets:
-    """One widget for each of some knobs, added where the GUI stands. ``moved`` is called, on any thread, with
-    the name of a knob that a user has moved."""
+    """One widget for each knob. ``moved`` is called, on any thread, with the name of a knob that a user has
+    moved."""
 
-    def __init__(
-        self, gui: viser.GuiApi, knobs: Sequence[Knob], config: Config, moved: Callable[[str], None]
-    ) -> None:
-        self._knobs = {knob.name: knob for knob in knobs}
+    def __init__(self, gui: viser.GuiApi, config: Config, moved: Callable[[str], None]) -> None:
+        self._gui, self._config, self._moved = gui, config, moved
+        self._knobs: dict[str, Knob] = {}
         self._handles: dict[str, Any] = {}
-        for knob in knobs:
-            value = shown_value(knob, config)
+
+    def add(self, section: str) -> None:
+        """Add the widgets of a section's knobs at the place where the GUI stands."""
+        for knob in (each for each in KNOBS if each.section == section):
             hint = knob.parameter.hint
             if knob.range is not None:
                 hint = Annotated[hint, knob.range]
-            handle = add_widget(gui, knob.label, hint, value, f"{knob.parameter.help} ({knob.name})")
+            value, text = shown_value(knob, self._config), f"{knob.parameter.help} ({knob.name})"
+            handle = add_widget(self._gui, knob.label, hint, value, text)
             handle.on_update(
-                lambda event, name=knob.name: moved(name) if event.client_id is not None else None
+                lambda event, name=knob.name: self._moved(name) if event.client_id is not None else None
             )
-            self._handles[knob.name] = handle
-        self.follow(config)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._knobs
+            self._knobs[knob.name], self._handles[knob.name] = knob, handle
+        self.follow(self._config)
 
     def applied(self, name: str, config: Config) -> Config:
         """The configuration with one parameter as its widget shows it. Raises ConfigError if the result is
@@ -282,7 +250,6 @@ class KnobWidgets:
             value = shown_value(knob, config)
             if self._handles[name].value != value:
                 self._handles[name].value = value
-        self.follow(config)
 
     def follow(self, config: Config) -> None:
         """Show the widgets of parameters that have an effect under this configuration, hide the others."""
@@ -356,10 +323,7 @@ def changes(first: Config, config: Config) -> str:
 
 
 def _short(config: Config, name: str) -> str:
-    value: object = dataclasses.asdict(config)
-    for field in name.split("."):
-        assert isinstance(value, dict)
-        value = value[field]
+    value = attrgetter(name)(config)
     if isinstance(value, tuple):
         return "(" + ", ".join(f"{term:.4g}" for term in value) + ")"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
