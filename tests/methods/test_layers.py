@@ -173,7 +173,7 @@ def test_scores_of_rays_without_an_answer() -> None:
     elsewhere = T_world_camera.copy()
     elsewhere[:3, 3] += 500.0
     assert (m.ray_scores(np.full(depth_m.shape, 2.0), elsewhere, camera()) == 0).all()
-    with pytest.raises(ConfigError, match=re.escape("shape (120, 160), not (2, 2)")):
+    with pytest.raises(ConfigError, match=re.escape("shape (90, 120), not (2, 2)")):
         m.ray_scores(np.ones((2, 2)), T_world_camera, camera())
     with pytest.raises(KeyframeError):
         m.ray_scores(depth_m, np.zeros((4, 4)), camera())

@@ -60,13 +60,12 @@ def built(frames: list[Frame]) -> MRFMap:
 
 
 def test_a_keyframes_noise_is_that_of_a_map_which_has_it() -> None:
-    own = built([replace(frame, noise=COARSE) for frame in small_room.frames()[:2]])
-    m = MRFMap(small_room.VOXEL_SIZE, COARSE)
-    for frame in small_room.frames()[:2]:
-        small_room.add(m, frame)
+    frame = small_room.frames()[0]  # one, because keyframes are swept in the order of their contents
+    own, m = built([replace(frame, noise=COARSE)]), MRFMap(small_room.VOXEL_SIZE, COARSE)
+    small_room.add(m, frame)
     m.infer()
     assert marginals(own) == marginals(m)
-    assert marginals(own) != marginals(small_room.build([0, 1]))
+    assert marginals(own) != marginals(small_room.build([0]))
 
 
 def test_the_models_sigma_given_for_each_pixel_changes_nothing() -> None:

@@ -30,7 +30,8 @@ def frame(index: int) -> Frame:
     first = small_room.frames()[0]
     depth_m = first.depth_m.copy()
     if index >= EMPTY:
-        depth_m[40:80, 60:100] *= 0.5
+        height, width = depth_m.shape
+        depth_m[height // 3 : 2 * height // 3, 3 * width // 8 : 5 * width // 8] *= 0.5
     return replace(first, depth_m=depth_m, stamp=START_S + index, name=f"room {index}")
 
 
@@ -162,9 +163,9 @@ def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPat
     assert 1 <= len(appeared) <= 2
     assert START_S + EMPTY <= appeared[-1].stamp_s < START_S + FRAMES
     f = frame(EMPTY)
-    z = float(f.depth_m[60, 80])
-    at = f.T_world_camera @ [(80 - f.camera.cx) / f.camera.fx * z, (60 - f.camera.cy) / f.camera.fy * z, z, 1]
-    assert np.linalg.norm(np.array(appeared[-1].centre_m) - at[:3]) < 0.4
+    v, u = f.camera.height // 2, f.camera.width // 2
+    at = f.T_world_camera[:3, :3] @ (f.camera.rays()[v, u] * f.depth_m[v, u]) + f.T_world_camera[:3, 3]
+    assert np.linalg.norm(np.array(appeared[-1].centre_m) - at) < 0.4
 
 
 def test_nothing_is_listed_of_a_scene_in_which_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ VOXEL_SIZE = 0.08
 @cache
 def frames() -> list[Frame]:
     """Ten frames around the room."""
-    dataset = open_dataset("synthetic:room?width=160&height=120&frames=10")
+    dataset = open_dataset("synthetic:room?width=120&height=90&frames=10")
     return [dataset.read(i) for i in range(len(dataset))]
 
 
