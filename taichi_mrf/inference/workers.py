@@ -45,7 +45,7 @@ def workers_for(arch: str, software: bool, longest: int, trace_bytes: int) -> Wo
     """
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 64, 512, 0)
+        return Workers(64, 16, 512, 0)
     if software:
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (trace_bytes * longest)
