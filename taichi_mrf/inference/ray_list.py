@@ -228,9 +228,10 @@ def _choose(
                     blocks.group[i] = 0
             for n in range(1, LEVELS + 1):
                 wide, high = 1 << (n + 1) // 2, 1 << n // 2
+                in_a_row = TILE.bit_length() - 1 - (n + 1) // 2  # their number's logarithm: no divisions
                 for block in range(TILE * TILE >> n):
-                    u = left + block % (TILE // wide) * wide
-                    v = top + block // (TILE // wide) * high
+                    u = left + (block & ((1 << in_a_row) - 1)) * wide
+                    v = top + (block >> in_a_row) * high
                     if u + wide <= right and v + high <= bottom:
                         _merge(rule, blocks, sensor, u, v, n)
             rays, grouped = 0, 0
@@ -268,11 +269,11 @@ def _write_down(
                     corner = v * width + u
                     if _has_rays(blocks, corner):
                         level = blocks.group[corner]
-                        wide = 1 << (level + 1) // 2
+                        columns = (level + 1) // 2  # their number's logarithm
                         rays.groups[group] = (corner << BITS) + level
                         rays.first[group] = ray
                         for k in range(1 << level):
-                            i = corner + k // wide * width + k % wide
+                            i = corner + (k >> columns) * width + (k & ((1 << columns) - 1))
                             if blocks.level[i] >= 0:
                                 rays.blocks[ray] = (i << BITS) + blocks.level[i]
                                 rays.depth[ray] = blocks.mean[i]
