@@ -33,6 +33,8 @@ other, so that a block is square or twice as wide as high."""
 BITS = 4
 """Of a ray's number, for its level; the rest is the number of its block's first pixel."""
 
+TILE_BITS = TILE.bit_length() - 1
+
 AGREE_VOXELS = 0.5
 AGREE_SIGMAS = 2.0
 """Measurements agree if they differ by no more than either of these."""
@@ -228,7 +230,7 @@ def _choose(
                     blocks.group[i] = 0
             for n in range(1, LEVELS + 1):
                 wide, high = 1 << (n + 1) // 2, 1 << n // 2
-                in_a_row = TILE.bit_length() - 1 - (n + 1) // 2  # their number's logarithm: no divisions
+                in_a_row = TILE_BITS - (n + 1) // 2  # their number's logarithm: no divisions
                 for block in range(TILE * TILE >> n):
                     u = left + (block & ((1 << in_a_row) - 1)) * wide
                     v = top + (block >> in_a_row) * high
