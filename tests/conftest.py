@@ -27,6 +27,9 @@ SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
 
+SLOW = (HERE / "doctor", HERE)
+"""Folders whose tests take minutes although they are few."""
+
 FOR_EVERY_BACKEND = ("backends", "compilers", "smoke")
 """Markers of the tests that run on every backend."""
 
@@ -127,14 +130,14 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 def _taken_tests(session: pytest.Session, files: list[pytest.Module]) -> Iterator[pytest.Item]:
     """The tests of the files that this process is the first to take. It takes those of a folder together,
     because they use the same kernels, which each process compiles; at the end it helps with the folders of
-    others. Large ones come first, after those of no folder, which are slow, so that all processes end at
+    others. Large ones come first, after those that are slow for their size, so that all processes end at
     about the same time."""
     files = sorted(files, key=lambda file: file.path.stat().st_size, reverse=True)
     folders: dict[Path, list[pytest.Module]] = {}
     for file in files:
         folders.setdefault(file.path.parent, []).append(file)
     sizes = {folder: sum(file.path.stat().st_size for file in inside) for folder, inside in folders.items()}
-    for folder in sorted(folders, key=lambda folder: (folder != HERE, -sizes[folder])):
+    for folder in sorted(folders, key=lambda folder: (folder not in SLOW, -sizes[folder])):
         if _is_first(session.config, folder):
             for file in folders[folder]:
                 yield from _its_tests(session, file)
