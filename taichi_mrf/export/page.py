@@ -25,6 +25,7 @@ from taichi_mrf.viewer.transport.downloads import standalone_page
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.voxels.cells import SUREST, lowest_voxels, standing_in, voxels_of_cells
 from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import COLORS, LOG_ODDS
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS
 
 _NOT_SHOWN = np.float32(-60)
@@ -101,15 +102,15 @@ def standing_cells(chunk: Chunk, threshold: float, evidence: float) -> list[tupl
     ``Shown.cells`` are their lowest voxels, the other values those of the cells. Voxels of more than
     ``evidence`` log-odds have evidence of a surface."""
     steps = int(np.floor(evidence / LOG_ODDS_STEP))
-    rows = np.flatnonzero((chunk.values["log_odds"] > steps).any(axis=1))
-    log_odds, corners = chunk.values["log_odds"][rows], chunk.bricks[rows] * BRICK
+    rows = np.flatnonzero((chunk.values[LOG_ODDS] > steps).any(axis=1))
+    log_odds, corners = chunk.values[LOG_ODDS][rows], chunk.bricks[rows] * BRICK
     marginals = _marginals()[log_odds.view(np.uint16)]
     found = []
     for side, standing, likely in standing_in(marginals, log_odds > steps, 1 / (1 + math.exp(-threshold))):
         row, cell = np.nonzero(standing)
         p = np.minimum(likely[row, cell].astype(np.float64), SUREST)
         voxels = rows[row][:, None], voxels_of_cells(side)[cell]
-        colors = _mean_colors(chunk.values["colors"][voxels]) if "colors" in chunk.values else None
+        colors = _mean_colors(chunk.values[COLORS][voxels]) if COLORS in chunk.values else None
         lowest = (corners[row] + lowest_voxels(side)[cell]).astype(np.uint8)
         seen = chunk.values["seen"][voxels].max(axis=1)
         found.append((side, Shown(lowest, pack_log_odds(np.log(p / (1 - p))), seen, colors)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.voxels.colors import NO_COLOR
-from taichi_mrf.voxels.layers import Layer
+from taichi_mrf.voxels.layers import COLORS, LOG_ODDS, Layer
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, offsets_in_brick
 
 ChunkKey = tuple[int, int, int]
@@ -21,11 +21,9 @@ _NOWHERE = -1
 _BITS = VOXELS.bit_length() - 1
 
 _LAYERS = {
-    "log_odds": Layer(
-        "int16", 1, -32768, "log-odds in LOG_ODDS_STEP; where they are missing nothing is shown"
-    ),
+    LOG_ODDS: Layer("int16", 1, -32768, "log-odds in LOG_ODDS_STEP; where they are missing nothing is shown"),
     "seen": Layer("uint8", 1, 0, "keyframes whose rays cross the voxel"),
-    "colors": Layer("uint8", 3, NO_COLOR, "red, green, blue that cameras saw"),
+    COLORS: Layer("uint8", 3, NO_COLOR, "red, green, blue that cameras saw"),
 }
 """The layers of a map as they are sent to the page."""
 
@@ -76,7 +74,7 @@ class Chunk:
     def __init__(self) -> None:
         self._row = np.full(CHUNK**3, _NOWHERE, np.int16)
         self._codes = np.zeros(0, np.int16)
-        self.values = {name: _missing(name, 0) for name in ("log_odds", "seen")}
+        self.values = {name: _missing(name, 0) for name in (LOG_ODDS, "seen")}
         """Values of the voxels by layer, (n, 512); colours once some are known, (n, 512, 3)."""
 
     def __len__(self) -> int:
@@ -113,7 +111,7 @@ class Chunk:
         """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
         cell along that axis is at most that."""
         every = {name: values.reshape(-1, *values.shape[2:]) for name, values in self.values.items()}
-        voxels = np.flatnonzero(every["log_odds"] >= np.ceil(log_odds / LOG_ODDS_STEP))
+        voxels = np.flatnonzero(every[LOG_ODDS] >= np.ceil(log_odds / LOG_ODDS_STEP))
         cells = _CELLS[self._codes.astype(np.int32)[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
         if hidden_above is not None:
             kept = cells[:, hidden_above[0]] <= hidden_above[1]
@@ -134,9 +132,9 @@ class Chunk:
         if row == _NOWHERE:
             return None
         number = np.ravel_multi_index(tuple(cell % BRICK), (BRICK,) * 3)
-        color = self.values["colors"][row, number] if "colors" in self.values else None
+        color = self.values[COLORS][row, number] if COLORS in self.values else None
         seen = color is not None and (color != NO_COLOR).any()
-        return int(self.values["log_odds"][row, number]), color if seen else None
+        return int(self.values[LOG_ODDS][row, number]), color if seen else None
 
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
@@ -144,7 +142,7 @@ class Chunk:
         voxels = np.flatnonzero(_IN_BRICK[:, axis] == cell % BRICK)
         others = [other for other in range(3) if other != axis]
         cells = _CELLS.reshape(CHUNK**3, VOXELS, 3)[np.ix_(self._codes[rows], voxels)]
-        log_odds = self.values["log_odds"][np.ix_(rows, voxels)]
+        log_odds = self.values[LOG_ODDS][np.ix_(rows, voxels)]
         return cells[..., others].reshape(-1, 2).astype(np.int32), log_odds.reshape(-1)
 
 
