@@ -40,7 +40,6 @@ def by_hand(d: float, extent: float, steep: float, weight: float) -> float:
     return math.log(z / (1 - z))
 
 
-@pytest.mark.parametrize("weight", [0.02, 3.0])
 def evidence_of(weight: NDArray, distance: NDArray) -> tuple[NDArray, NDArray]:
     """The oracle: log(z / (1 - z)) of the voxels of a box without its outermost, from the sums of weights and
     of distances times weight, and whether each is behind the surface; NaN where there is no distance."""

@@ -46,22 +46,9 @@ def stating(number: int, noise: PolynomialNoise | None = None) -> Frame:
     return replace(frame, noise=noise, sigma_m=sigma.astype(np.float32))
 
 
-def add(m: MRFMap, frame: Frame) -> int:
-    parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
-    return m.add_keyframe(*parts, **frame.own.arguments())
-
-
-def built(frames: list[Frame]) -> MRFMap:
-    m = MRFMap(small_room.VOXEL_SIZE)
-    for frame in frames:
-        add(m, frame)
-    m.infer()
-    return m
-
-
 def test_a_keyframes_noise_is_that_of_a_map_which_has_it() -> None:
     frame = small_room.frames()[0]  # one, because keyframes are swept in the order of their contents
-    own, m = built([replace(frame, noise=COARSE)]), MRFMap(small_room.VOXEL_SIZE, COARSE)
+    own, m = small_room.build([replace(frame, noise=COARSE)]), MRFMap(small_room.VOXEL_SIZE, COARSE)
     small_room.add(m, frame)
     m.infer()
     assert marginals(own) == marginals(m)
@@ -72,11 +59,14 @@ def test_the_models_sigma_given_for_each_pixel_changes_nothing() -> None:
     frame = small_room.frames()[0]
     plain = small_room.build([0])
     sigma = plain.noise.table(frame.camera).at_pixels(frame.depth_m)[0].astype(np.float32)
-    same = built([replace(frame, sigma_m=sigma)])
+    same = small_room.build([replace(frame, sigma_m=sigma)])
     assert same.keyframes[0].ray_list.number == plain.keyframes[0].ray_list.number
     centres, p = plain.voxels(0.0)
     np.testing.assert_allclose(same.occupancy(centres), p, atol=1e-3)
-    assert marginals(built([replace(frame, sigma_m=np.zeros_like(sigma))])).keys() == marginals(plain).keys()
+    assert (
+        marginals(small_room.build([replace(frame, sigma_m=np.zeros_like(sigma))])).keys()
+        == marginals(plain).keys()
+    )
 
 
 @settings(max_examples=8)
@@ -148,7 +138,7 @@ def test_edits_in_any_order_end_in_the_same_map_bit_for_bit(history: list[tuple[
     m, present = MRFMap(small_room.VOXEL_SIZE), {}
     for verb, number in history:
         if verb == "add" and number not in present:
-            present[number] = add(m, frames[number])
+            present[number] = small_room.add(m, frames[number])
         elif verb == "remove" and number in present:
             m.remove_keyframe(present.pop(number))
         elif verb == "move" and number in present:
@@ -158,18 +148,18 @@ def test_edits_in_any_order_end_in_the_same_map_bit_for_bit(history: list[tuple[
             m.infer(sweeps=1)
     for number in range(3):
         if number not in present:
-            add(m, frames[number])
+            small_room.add(m, frames[number])
     if 3 in present:
         m.remove_keyframe(present[3])
     m.infer()
-    assert marginals(m) == marginals(built(frames[:3]))
+    assert marginals(m) == marginals(small_room.build(frames[:3]))
 
 
 def test_saved_maps_keep_what_keyframes_state(tmp_path: Path) -> None:
     camera = small_room.frames()[0].camera
     patches = PatchNoise(np.full((4, 2), 0.01), np.full((4, 1), 0.002), 80, camera)
     frames = [stating(0, COARSE), replace(small_room.frames()[1], noise=patches), small_room.frames()[2]]
-    m = built(frames)
+    m = small_room.build(frames)
     m.freeze_keyframe(2)
     m.infer()
     m.save(tmp_path / "map.npz")
@@ -186,7 +176,7 @@ def test_saved_maps_keep_what_keyframes_state(tmp_path: Path) -> None:
 def test_recursive_maps_use_and_save_it(tmp_path: Path) -> None:
     for kind, parameters in ((LogOddsMap, {"correct_bias": True}), (VisibilityMap, {})):
         m, plain, coarse = (kind(small_room.VOXEL_SIZE, n, **parameters) for n in (None, None, BIASED))
-        add(m, replace(small_room.frames()[0], noise=BIASED))
+        small_room.add(m, replace(small_room.frames()[0], noise=BIASED))
         small_room.add(plain, small_room.frames()[0])
         small_room.add(coarse, small_room.frames()[0])
         assert marginals(m) == marginals(coarse) != marginals(plain)
@@ -196,7 +186,7 @@ def test_recursive_maps_use_and_save_it(tmp_path: Path) -> None:
         loaded.infer()
         assert marginals(loaded) == marginals(coarse)
     stated = VisibilityMap(small_room.VOXEL_SIZE)
-    add(stated, stating(0))
+    small_room.add(stated, stating(0))
     assert marginals(stated) != marginals(plain)
     stored = stated.keyframes[0]
     assert isinstance(stored, StoredKeyframe)
@@ -212,14 +202,14 @@ def test_a_live_run_switches_them_off_and_on_bit_for_bit() -> None:
     link = FakeLink()
     session = session_of(link, StatingRoom("room", small_room.frames()[0].camera, count=3))
     before = marginals(finished(session))
-    assert before == marginals(built([stating(0), stating(1, COARSE), stating(2)]))
+    assert before == marginals(small_room.build([stating(0), stating(1, COARSE), stating(2)]))
     for on in (False, True):
         link.ask(Switch(1, on=on))
         assert (marginals(finished(session)) == before) is on
 
 
 def test_held_out_frames_are_judged_by_their_own_noise_and_aligned_by_it() -> None:
-    m = built([stating(0), stating(1)])
+    m = small_room.build([stating(0), stating(1)])
     frame = stating(2)
     judged, plain = judge(m, frame), judge(m, small_room.frames()[2])
     sigma, _ = judged.noise.at_pixels(frame.depth_m)
@@ -239,4 +229,4 @@ class NoPolynomials:
 def test_sigmas_need_polynomials() -> None:
     frame = stating(0)
     with pytest.raises(ConfigError, match="sigma_m needs noise made of polynomials, which NoPolynomials"):
-        add(MRFMap(0.1), replace(frame, noise=NoPolynomials()))  # type: ignore[arg-type]
+        small_room.add(MRFMap(0.1), replace(frame, noise=NoPolynomials()))  # type: ignore[arg-type]

@@ -41,8 +41,7 @@ def empty(method: str) -> RecursiveMap:
 
 
 def add(m: RecursiveMap, number: int) -> int:
-    frame = small_room.frames()[number]
-    return m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+    return small_room.add(m, small_room.frames()[number])
 
 
 def build(method: str, numbers: list[int]) -> RecursiveMap:
@@ -136,7 +135,7 @@ def test_any_history_ends_in_the_map_of_the_final_scans(each: str, history: list
     assert not m.stale
     anew = empty(each)
     for image, pose in present.values():
-        anew.add_keyframe(room[image].depth_m, room[pose].T_world_camera, room[image].camera)
+        small_room.add(anew, room[image], room[pose].T_world_camera)
     assert_same_map(m, anew)
 
 

@@ -20,7 +20,7 @@ COUNT = 5
 
 
 def built() -> MRFMap:
-    return small_room.build(list(range(COUNT)))
+    return small_room.build(range(COUNT))
 
 
 def shifted(number: int, *tangent: float) -> np.ndarray:
@@ -28,17 +28,6 @@ def shifted(number: int, *tangent: float) -> np.ndarray:
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = cv2.Rodrigues(np.array(tangent[:3], np.float64))[0], tangent[3:]
     return step @ small_room.frames()[number].T_world_camera
-
-
-def anew(poses: dict[int, np.ndarray]) -> MRFMap:
-    """The map of the frames with some poses replaced."""
-    m = MRFMap(small_room.VOXEL_SIZE)
-    for number in range(COUNT):
-        frame = small_room.frames()[number]
-        T = poses.get(number, frame.T_world_camera)
-        m.add_keyframe(frame.depth_m, T, frame.camera, frame.name)
-    m.infer()
-    return m
 
 
 def near_share(a: MRFMap, b: MRFMap) -> float:
@@ -76,15 +65,15 @@ def test_inference_afterwards_makes_the_map_that_is_made_anew(
         while left:
             left = dict(m.update_poses(left, least=0.0, seconds=0.0).left)
     m.infer()
-    assert_same(m, anew(poses))
+    assert_same(m, small_room.build(range(COUNT), poses))
 
 
 def test_a_map_is_nearly_the_one_made_anew_without_inference_over_all() -> None:
     m = built()
     poses = {number: shifted(number, 0.0, 0.0, 0.05, 0.3, 0.0, 0.0) for number in (1, 3)}
-    before = near_share(m, anew(poses))
+    before = near_share(m, small_room.build(range(COUNT), poses))
     update = m.update_poses(poses, tolerance=0.02)
-    after = near_share(m, anew(poses))
+    after = near_share(m, small_room.build(range(COUNT), poses))
     assert update.complete
     assert set(update.moved) == {1, 3}
     assert after > max(0.95, before + 0.03)
@@ -151,10 +140,10 @@ def test_a_call_that_ends_early_leaves_a_map_that_infers_exactly(
     there = {i for i, T in poses.items() if (m.keyframes[i].T_world_camera == T).all()}
     assert len(there) == (2 if error is CapacityError else 3)
     m.infer()
-    assert_same(m, anew({i: poses[i] for i in there}))
+    assert_same(m, small_room.build(range(COUNT), {i: poses[i] for i in there}))
     m.update_poses(poses, least=0.0)
     m.infer()
-    assert_same(m, anew(poses))
+    assert_same(m, small_room.build(range(COUNT), poses))
 
 
 def test_a_pose_that_hardly_changes_leaves_the_keyframe_where_it_is() -> None:

@@ -1,13 +1,13 @@
 """Whole maps against the oracle in NumPy, and what such a map must do whatever its numbers are."""
 
 import dataclasses
-from pathlib import Path
 
 import corridor
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from one_pixel import ONE_PIXEL, random_pose
 from oracles import visibility as reference
 from oracles.forward import Noise
 
@@ -22,21 +22,10 @@ from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
 pytestmark = pytest.mark.usefixtures("backend")
 
 VOXEL = 0.2
-ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
 NEAR = VolumeConfig(dense_bricks=32)
 """Where a map is dense (Vulkan), it need not reach far here."""
 
 STEREO = PolynomialNoise((0.0, 0.0, corridor.STEREO_LAMBDA))
-
-
-def random_pose(rng: np.random.Generator, reach: float) -> np.ndarray:
-    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
-    Q *= np.sign(np.diag(R))
-    if np.linalg.det(Q) < 0:
-        Q[:, 0] *= -1
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Q, rng.uniform(-reach, reach, 3)
-    return T
 
 
 def centres(voxels: list[reference.Voxel]) -> np.ndarray:
@@ -166,9 +155,6 @@ def test_no_measurement_changes_nothing() -> None:
     assert len(m.voxels(0.0)[0]) == 0
 
 
-# The scans of a map.
-
-
 def views() -> tuple[PinholeCamera, np.ndarray, list[np.ndarray]]:
     camera = corridor.camera(48)
     poses = []
@@ -190,34 +176,6 @@ def build(poses: list[np.ndarray]) -> VisibilityMap:
     for T in poses:
         m.add_keyframe(depth, T, camera)
     return m
-
-
-def test_removing_gives_the_map_of_the_others() -> None:
-    _, _, poses = views()
-    m = build(poses)
-    m.remove_keyframe(1)
-    m.infer()
-    assert belief(m) == belief(build([poses[0], *poses[2:]]))
-
-
-def test_moving_gives_the_map_of_the_final_poses() -> None:
-    _, _, poses = views()
-    m = build(poses[:3])
-    m.move_keyframe(1, poses[3])
-    m.infer()
-    assert belief(m) == belief(build([poses[0], poses[3], poses[2]]))
-
-
-def test_a_loaded_map_goes_on_as_if_it_had_not_been_saved(tmp_path: Path) -> None:
-    camera, depth, poses = views()
-    m = build(poses[:3])
-    m.save(tmp_path / "map.npz")
-    loaded = VisibilityMap.load(tmp_path / "map.npz")
-    assert loaded.config == m.config
-    assert belief(loaded) == belief(m)
-    for each in (m, loaded):
-        each.add_keyframe(depth, poses[3], camera)
-    assert belief(loaded) == belief(m)
 
 
 def test_the_order_of_the_rays_does_not_change_a_bit() -> None:

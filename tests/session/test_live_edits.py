@@ -6,7 +6,6 @@ import small_room
 from live_scene import (
     FakeLink,
     assert_shown_is,
-    built,
     during_settling,
     finished,
     last_status,
@@ -27,7 +26,7 @@ def test_off_is_the_map_without_it_and_on_brings_it_back_bit_for_bit() -> None:
     before = marginals(finished(session))
     voxels_before = len(shown(link.sent).voxels())
     link.ask(Switch(1, on=False))
-    assert marginals(finished(session)) == marginals(built([0, 2, 3]))
+    assert marginals(finished(session)) == marginals(small_room.build([0, 2, 3]))
     assert_shown_is(session, link)
     assert len(shown(link.sent).voxels()) < voxels_before
     assert shown(link.sent).keyframes[1].state == "off"
@@ -38,26 +37,17 @@ def test_off_is_the_map_without_it_and_on_brings_it_back_bit_for_bit() -> None:
     assert list(shown(link.sent).keyframes) == [0, 1, 2, 3]
 
 
-def test_a_moved_keyframe_gives_the_map_of_its_new_place() -> None:
+@pytest.mark.parametrize("while_off", [False, True])
+def test_a_moved_keyframe_gives_the_map_of_its_new_place(while_off: bool) -> None:
     T = small_room.frames()[2].T_world_camera.copy()
     T[:3, 3] += (0.2, -0.1, 0.05)
     link = FakeLink()
     session = session_of(link)
     finished(session)
-    link.ask(Move(2, T))
-    assert marginals(finished(session)) == marginals(built(range(4), {2: T}))
+    link.ask(*((Switch(2, on=False), Move(2, T), Switch(2, on=True)) if while_off else (Move(2, T),)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4), {2: T}))
     assert_shown_is(session, link)
     np.testing.assert_array_equal(shown(link.sent).keyframes[2].T_world_camera, T)
-
-
-def test_a_keyframe_that_is_off_can_be_moved() -> None:
-    T = small_room.frames()[2].T_world_camera.copy()
-    T[:3, 3] += (0.2, -0.1, 0.05)
-    link = FakeLink()
-    session = session_of(link)
-    finished(session)
-    link.ask(Switch(2, on=False), Move(2, T), Switch(2, on=True))
-    assert marginals(finished(session)) == marginals(built(range(4), {2: T}))
 
 
 def test_a_frozen_keyframe_stays_in_the_map_and_can_be_changed_no_more() -> None:
@@ -95,7 +85,7 @@ def test_edits_while_frames_come_act_at_once_and_end_in_the_same_map() -> None:
     link = FakeLink(react)
     session = session_of(link, room(5))
     m = finished(session)
-    assert marginals(m) == marginals(built([1, 2, 3, 4]))
+    assert marginals(m) == marginals(small_room.build([1, 2, 3, 4]))
     assert_shown_is(session, link)
     off = next(i for i, u in enumerate(link.sent) if isinstance(u, KeyframeInfo) and u.state == "off")
     later = [u.id for u in link.sent[off:] if isinstance(u, KeyframeInfo) and u.state == "on"]
@@ -108,7 +98,7 @@ def test_an_edit_breaks_full_inference_off_and_is_seen_at_once() -> None:
     link = FakeLink(during_settling(Switch(3, on=False)))
     session = session_of(link)
     m = finished(session)
-    assert marginals(m) == marginals(built([0, 1, 2]))
+    assert marginals(m) == marginals(small_room.build([0, 1, 2]))
     off = next(i for i, u in enumerate(link.sent) if isinstance(u, KeyframeInfo) and u.state == "off")
     assert isinstance(link.sent[off + 1], Bricks)
     at_once = shown(link.sent[: off + 2])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import small_room
-from live_scene import CONFIG, FakeLink, assert_shown_is, built, finished, marginals, room, shown, source
+from live_scene import CONFIG, FakeLink, assert_shown_is, finished, marginals, room, shown, source
 
 from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
 from taichi_mrf.datasets.pose_sources.posed import posed_by
@@ -58,11 +58,11 @@ def test_keyframes_move_when_the_poses_change_and_the_map_is_that_of_the_last_po
     first = {1: shifted(1, 0.05), 2: shifted(2, 0.0, 0.1)}
     told.tell(first)
     session = following(link, told)
-    assert marginals(finished(session)) == marginals(built(range(4), first))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4), first))
     last = {0: shifted(0, 0.3, 0.0, 0.0), 1: shifted(1, 0.0, 0.2, 0.0), 2: shifted(2, 0.0, 0.1, 1e-5)}
     told.tell(last)
     link.sent.clear()
-    assert marginals(finished(session)) == marginals(built(range(4), last))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4), last))
     assert link.errors() == []
     moved = [info.id for info in link.of_type(KeyframeInfo)]
     assert moved == [0, 1, 2]  # the one that moves most first, one at a time, the hardly moved one at the end
@@ -85,7 +85,7 @@ def test_poses_that_change_while_the_map_settles_are_taken_in_before_it_ends() -
 
     link = FakeLink(react)
     session = following(link, told)
-    assert marginals(finished(session)) == marginals(built(range(4), last))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4), last))
     assert_shown_is(session, link)
 
 
@@ -98,13 +98,13 @@ def test_what_a_user_has_moved_or_switched_off_stays_so() -> None:
     finished(session)
     told.tell({1: shifted(1, 0.3), 2: shifted(2, 0.1), 3: shifted(3, 0.2)})
     m = finished(session)
-    assert marginals(m) == marginals(built([0, 1, 3], {1: by_hand, 3: shifted(3, 0.2)}))
+    assert marginals(m) == marginals(small_room.build([0, 1, 3], {1: by_hand, 3: shifted(3, 0.2)}))
     assert shown(link.sent).keyframes[2].state == "off"
     link.ask(Switch(2, on=True))  # it comes back where the file has it
     poses = {1: by_hand, 2: shifted(2, 0.1), 3: shifted(3, 0.2)}
     # Its number in the map is a new one, and the sums are those of another order.
     centres, p = finished(session).voxels(0.0)
-    np.testing.assert_allclose(built(range(4), poses).occupancy(centres), p, atol=0.02)
+    np.testing.assert_allclose(small_room.build(range(4), poses).occupancy(centres), p, atol=0.02)
 
 
 def test_a_method_without_messages_follows_too() -> None:

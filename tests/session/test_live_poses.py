@@ -1,6 +1,5 @@
 """Live runs whose poses are refined, or found: what becomes of the keyframes, the map, and the page."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +9,7 @@ import pytest
 import tracked_room
 from live_scene import (
     FakeLink,
+    asking,
     assert_shown_is,
     finished,
     last_status,
@@ -47,11 +47,9 @@ from taichi_mrf.viewer.messages import (
     Notice,
     PixelRay,
     RayAnswer,
-    Request,
     Reset,
     Status,
     Switch,
-    Update,
 )
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -108,18 +106,6 @@ def assert_is_the_map_of_its_poses(session: Session, link: FakeLink, ids: list[i
     again.infer()
     assert marginals(session.state.mapper.map) == marginals(again)
     assert_shown_is(session, link)
-
-
-def asking(activity: str, request: Request) -> Callable[[Update], list[Request]]:
-    """Asks for something once, as soon as a status begins with some words."""
-    left = [request]
-
-    def react(update: Update) -> list[Request]:
-        if isinstance(update, Status) and update.activity.startswith(activity) and left:
-            return [left.pop()]
-        return []
-
-    return react
 
 
 def test_keyframes_are_aligned_as_they_come_and_together_at_the_end() -> None:

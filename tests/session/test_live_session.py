@@ -12,7 +12,6 @@ from live_scene import (
     CONFIG,
     FakeLink,
     assert_shown_is,
-    built,
     during_settling,
     finished,
     last_status,
@@ -64,7 +63,7 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 def test_a_run_ends_in_the_map_of_its_frames() -> None:
     link = FakeLink()
     session = session_of(link)
-    assert marginals(finished(session)) == marginals(built(range(4)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4)))
     assert_shown_is(session, link)
     assert isinstance(link.sent[0], Hello)
     assert [k.name for k in link.of_type(KeyframeInfo)] == [f.name for f in small_room.frames()[:4]]
@@ -111,12 +110,12 @@ def test_full_inference_answers_from_the_map_as_it_was(request_: Request, kind: 
     between = link.sent[sweeps[1] : sweeps[-1]]
     assert any(isinstance(update, kind) for update in between)
     assert not any(isinstance(update, Bricks) for update in between), "nothing half-done is published"
-    assert marginals(m) == marginals(built(range(4)))
+    assert marginals(m) == marginals(small_room.build(range(4)))
 
 
 def test_a_map_whose_inference_was_stopped_is_shown_as_saved_and_a_notice_says_so(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
-    m = built(range(3))
+    m = small_room.build(range(3))
     whole = map_voxels(m)
     m.infer(sweeps=1)
     m.save(path)
@@ -139,26 +138,30 @@ def test_a_map_whose_inference_was_stopped_is_shown_as_saved_and_a_notice_says_s
 
 def test_a_saved_map_is_done_at_once_and_an_edit_brings_its_messages(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
-    built(range(3)).save(path)
+    small_room.build(range(3)).save(path)
     link = FakeLink()
-    session = Session(Source("map.npz", CONFIG, lambda: load_map(path)), link, Policy(leave_when_done=True))
+    opened, notes = open_source(str(path), Config(), every=1, limit=None, speed=0.0, loop=False)
+    assert "its own parameters" in notes[0]
+    session = Session(opened, link, Policy(leave_when_done=True))
+    assert link.of_type(Bricks) == [], "nothing is shown before what is occupied"
     mapped = finished(session)
     assert session.state.is_done
     assert session.state.mapper.inferred is None
     assert not any(isinstance(u, Status) and u.activity.startswith("sweeping") for u in link.sent)
-    assert marginals(mapped) == marginals(built(range(3)))
+    assert marginals(mapped) == marginals(small_room.build(range(3)))
     whole = map_voxels(mapped)
-    assert shown(link.sent).voxels() == map_voxels(built(range(3)))
+    assert shown(link.sent).voxels() == map_voxels(small_room.build(range(3)))
     assert session.state.mapper.inferred is None
     link.ask(Watch(images=False, view=None, baseline=False), Switch(2, on=False))
-    assert marginals(finished(session)) == marginals(built(range(2)))
-    assert shown(link.sent).voxels() == map_voxels(built(range(2))) != whole
+    assert marginals(finished(session)) == marginals(small_room.build(range(2)))
+    assert shown(link.sent).voxels() == map_voxels(small_room.build(range(2))) != whole
+    assert_shown_is(session, link)
     assert link.errors() == []
 
 
 def test_what_messages_tell_brings_the_messages_of_a_saved_map(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
-    built(range(3)).save(path)
+    small_room.build(range(3)).save(path)
     link = FakeLink()
     session = Session(Source("map.npz", CONFIG, lambda: load_map(path)), link, Policy(leave_when_done=True))
     finished(session)
@@ -187,7 +190,7 @@ def test_a_stop_during_full_inference_leaves_the_map_that_was_shown() -> None:
     session.run(lambda: any(s.activity.startswith("sweeping keyframe 3 ") for s in link.of_type(Status)[-1:]))
     assert not session.state.is_done
     assert_shown_is(session, link, decided=False)
-    assert marginals(finished(session)) == marginals(built(range(4)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4)))
 
 
 def test_a_stop_after_the_first_sweep_keeps_what_was_computed() -> None:
@@ -198,10 +201,10 @@ def test_a_stop_after_the_first_sweep_keeps_what_was_computed() -> None:
     assert not session.state.is_done
     assert session.state.result().sweeps == 2
     assert_shown_is(session, link, decided=False)
-    twin = built(range(4))
+    twin = small_room.build(range(4))
     twin.infer(progress=lambda step: (step.sweep, step.keyframe) != (2, 2))
     assert marginals(session.state.mapper.map) == marginals(twin)
-    assert marginals(finished(session)) == marginals(built(range(4)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4)))
 
 
 def test_a_paused_run_takes_one_keyframe_a_step() -> None:
@@ -216,9 +219,9 @@ def test_a_paused_run_takes_one_keyframe_a_step() -> None:
         waits = link.waits
         session.run(lambda waits=waits: link.waits > waits)
         assert len(link.of_type(KeyframeInfo)) == steps
-        assert marginals(session.state.mapper.map) == marginals(built(range(steps)))
+        assert marginals(session.state.mapper.map) == marginals(small_room.build(range(steps)))
     link.ask(Pause(False))
-    assert marginals(finished(session)) == marginals(built(range(4)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4)))
 
 
 def test_going_on_does_not_wait_for_full_inference() -> None:
@@ -236,7 +239,7 @@ def test_going_on_does_not_wait_for_full_inference() -> None:
         return []
 
     link = FakeLink(react)
-    assert marginals(finished(session_of(link))) == marginals(built(range(4)))
+    assert marginals(finished(session_of(link))) == marginals(small_room.build(range(4)))
     activities = [status.activity for status in link.of_type(Status)]
     broken_off = activities.index("sweeping keyframe 1 of 2 (sweep 1 of 3)")
     assert activities[broken_off + 1] == "reading frame 3 of 4"
@@ -245,7 +248,7 @@ def test_going_on_does_not_wait_for_full_inference() -> None:
 def test_a_broken_frame_gives_a_notice_and_mapping_goes_on() -> None:
     link = FakeLink()
     session = session_of(link, room(4, broken=(1, 2)))
-    assert marginals(finished(session)) == marginals(built([0, 3]))
+    assert marginals(finished(session)) == marginals(small_room.build([0, 3]))
     assert link.errors() == [f"room {i}: the image is damaged" for i in (1, 2)]
 
 
@@ -264,7 +267,7 @@ def test_a_full_map_pauses_with_a_notice(monkeypatch: pytest.MonkeyPatch) -> Non
     name = small_room.frames()[2].name
     assert link.errors() == [f"frame {name} does not fit: the map would not fit"]
     assert last_status(link).paused
-    assert marginals(session.state.mapper.map) == marginals(built(range(2)))
+    assert marginals(session.state.mapper.map) == marginals(small_room.build(range(2)))
     assert session.state.full in link.errors()
 
 
@@ -279,7 +282,7 @@ def test_a_run_that_nobody_watches_ends_when_the_map_is_full() -> None:
     assert 0 < count < 10
     assert f"frame {small_room.frames()[count].name} does not fit" in str(session.state.full)
     assert not session.state.mapper.unsettled
-    assert marginals(mapped) == marginals(built(range(count)))
+    assert marginals(mapped) == marginals(small_room.build(range(count)))
 
 
 @pytest.mark.parametrize(
@@ -310,7 +313,7 @@ def test_reset_begins_anew_with_new_numbers() -> None:
     session = session_of(link)
     finished(session)
     link.ask(Reset())
-    assert marginals(finished(session)) == marginals(built(range(4)))
+    assert marginals(finished(session)) == marginals(small_room.build(range(4)))
     assert len(link.of_type(Hello)) == 2
     assert list(shown(link.sent).keyframes) == [4, 5, 6, 7]
     assert_shown_is(session, link)
@@ -339,29 +342,6 @@ def test_methods_that_cannot_take_a_scan_back_are_made_anew(method: str) -> None
     assert marginals(session.state.mapper.map) == marginals(expected)
     assert_shown_is(session, link)
     assert link.errors() == []
-
-
-def test_a_map_from_a_file_is_shown_and_can_be_edited(tmp_path: Path) -> None:
-    path = tmp_path / "map.npz"
-    built(range(4)).save(path)
-    opened, notes = open_source(str(path), Config(), every=1, limit=None, speed=0.0, loop=False)
-    assert "its own parameters" in notes[0]
-    link = FakeLink()
-    session = Session(opened, link, Policy(leave_when_done=True))
-    assert link.of_type(Bricks) == [], "nothing is shown before what is occupied"
-    finished(session)
-    assert shown(link.sent).voxels() == map_voxels(built(range(4)))
-    link.ask(Switch(1, on=False))
-    assert marginals(finished(session)) == marginals(built([0, 2, 3]))
-    assert_shown_is(session, link)
-
-
-def test_frames_that_are_held_out_stay_out() -> None:
-    config = Config(voxel_size=CONFIG.voxel_size)
-    link = FakeLink()
-    session_of(link, room(10), config).run(never)
-    names = [frame.name for frame in small_room.frames()]
-    assert [k.name for k in link.of_type(KeyframeInfo)] == [n for i, n in enumerate(names) if i != 5]
 
 
 def test_a_new_viewer_is_told_everything() -> None:

@@ -171,17 +171,6 @@ def finished(session: Session) -> MRFMap:
     return m
 
 
-def built(chosen: Iterable[int], poses: dict[int, np.ndarray] | None = None) -> MRFMap:
-    """A map made without a session, of some of the frames, at other poses if they are given."""
-    m = MRFMap.from_config(CONFIG, small_room.frames()[0].camera)
-    for i in chosen:
-        frame = small_room.frames()[i]
-        T_world_camera = (poses or {}).get(i, frame.T_world_camera)
-        m.add_keyframe(frame.depth_m, T_world_camera, frame.camera)
-    m.infer()
-    return m
-
-
 def assert_shown_is(session: Session, link: FakeLink, decided: bool = True) -> None:
     """What the viewer knows are the very voxels of the map, or, until the rays' votes are counted, those of
     its marginals."""
@@ -191,13 +180,18 @@ def assert_shown_is(session: Session, link: FakeLink, decided: bool = True) -> N
     assert len(view.bricks["map"]) == m.statistics().bricks
 
 
-def during_settling(request: Request) -> Callable[[Update], list[Request]]:
-    """Asks for something once, in the middle of the first full inference."""
+def asking(activity: str, request: Request) -> Callable[[Update], list[Request]]:
+    """Asks for something once, as soon as a status begins with some words."""
     left = [request]
 
     def react(update: Update) -> list[Request]:
-        if isinstance(update, Status) and update.activity.startswith("sweeping keyframe 2 ") and left:
+        if isinstance(update, Status) and update.activity.startswith(activity) and left:
             return [left.pop()]
         return []
 
     return react
+
+
+def during_settling(request: Request) -> Callable[[Update], list[Request]]:
+    """Asks for something once, in the middle of the first full inference."""
+    return asking("sweeping keyframe 2 ", request)

@@ -5,11 +5,14 @@ because Taichi can be started only once in a process: ``python small_room.py cpu
 """
 
 import sys
+from collections.abc import Iterable, Mapping
 from functools import cache
 
 import numpy as np
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
@@ -24,15 +27,20 @@ def frames() -> list[Frame]:
     return [dataset.read(i) for i in range(len(dataset))]
 
 
-def add(m: MRFMap, frame: Frame) -> int:
-    return m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+def add(m: BrickMap, frame: Frame, T_world_camera: Pose | None = None) -> int:
+    """Add a frame with what it states itself, at its own pose or at another."""
+    T = frame.T_world_camera if T_world_camera is None else T_world_camera
+    return m.add_keyframe(frame.depth_m, T, frame.camera, frame.name, **frame.own.arguments())
 
 
-def build(chosen: list[int]) -> MRFMap:
-    """A map of some of the frames, fully inferred."""
+def build(chosen: Iterable[int | Frame], poses: Mapping[int, Pose] | None = None) -> MRFMap:
+    """A map of some of the frames, or of others, fully inferred; ``poses`` replaces some by their numbers."""
     m = MRFMap(VOXEL_SIZE)
     for i in chosen:
-        add(m, frames()[i])
+        if isinstance(i, Frame):
+            add(m, i)
+        else:
+            add(m, frames()[i], (poses or {}).get(i))
     m.infer()
     return m
 
