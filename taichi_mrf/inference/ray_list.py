@@ -71,9 +71,9 @@ def block_noise(block: I32, sensor: Template):
 def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how
     many pixels the block has."""
-    u, v, wide, high = block_of(rays.blocks[i], sensor.camera.width)
-    ray = pixel_ray(sensor, view, u + 0.5 * (wide - 1), v + 0.5 * (high - 1))
-    return ray, sensor.noise_at(u + wide // 2, v + high // 2), wide * high
+    block = rays.blocks[i]
+    _, _, wide, high = block_of(block, sensor.camera.width)
+    return block_ray(block, sensor, view), block_noise(block, sensor), wide * high
 
 
 def rays_per_voxel(voxel_size: float, ray_density: float) -> float:

@@ -47,12 +47,15 @@ def test_no_covariance_and_one_of_zeros_make_the_same_map_bit_for_bit() -> None:
 
 
 def test_a_doubtful_keyframe_is_one_of_wider_sigmas_without_the_pixels_beside_edges() -> None:
-    frame = small_room.frames()[0]
-    doubtful, stated = built(DOUBT), MRFMap(small_room.VOXEL_SIZE)
+    number = 8  # a view of many edges
+    frame = small_room.frames()[number]
+    doubtful, stated = (MRFMap(small_room.VOXEL_SIZE) for _ in range(2))
+    add(doubtful, number, DOUBT)
+    doubtful.infer()
     sigma, _ = stated.noise.table(frame.camera).at_pixels(frame.depth_m)
     widened = np.hypot(sigma, depth_sigma(frame.depth_m, frame.camera, DOUBT))
     beside = beside_edges(frame.depth_m, frame.camera, DOUBT)
-    assert 0 < beside.mean() < 0.2
+    assert 0.01 < beside.mean() < 0.2
     parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
     stated.add_keyframe(*parts, sigma_m=np.where(beside, np.inf, widened))
     stated.infer()
@@ -63,7 +66,7 @@ def test_a_doubtful_keyframe_is_one_of_wider_sigmas_without_the_pixels_beside_ed
     keyframe = doubtful.keyframes[0]
     left_out = np.where(beside, frame.depth_m, 0.0)
     np.testing.assert_array_equal(keyframe.depth_m, stated.keyframes[0].depth_m + left_out)
-    own, plain = (oriented_points(m.keyframes[0].image, 10.0) for m in (doubtful, small_room.build([0])))
+    own, plain = (oriented_points(m.keyframes[0].image, 10.0) for m in (doubtful, small_room.build([number])))
     for name in ("points", "normals", "sigmas"):
         np.testing.assert_array_equal(getattr(own, name), getattr(plain, name))
 

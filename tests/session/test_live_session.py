@@ -344,6 +344,14 @@ def test_methods_that_cannot_take_a_scan_back_are_made_anew(method: str) -> None
     assert link.errors() == []
 
 
+def test_frames_that_are_held_out_stay_out() -> None:
+    config = Config(voxel_size=CONFIG.voxel_size)
+    link = FakeLink()
+    session_of(link, room(10), config).run(never)
+    names = [frame.name for frame in small_room.frames()]
+    assert [k.name for k in link.of_type(KeyframeInfo)] == [n for i, n in enumerate(names) if i != 5]
+
+
 def test_a_new_viewer_is_told_everything() -> None:
     first, second = FakeLink(), FakeLink()
     session = session_of(first, keep_live=3)

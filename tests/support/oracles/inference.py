@@ -68,11 +68,7 @@ def cast_as_group(
     )
     nearest = min(float(noise.depth_of_deviation(float(depth), SUPPORT)) for depth in depth_m.flat)
     apart = max(0.0, min(nearest, max_depth) - CLEAR_VOXELS * voxel_size / float(np.linalg.norm(middle)))
-    cells, near, far = segments(T[:3, 3], middle, 0.0, apart, voxel_size)
-    lengths = (far - near) * np.linalg.norm(middle) / voxel_size
-    common = [
-        Segment((int(i), int(j), int(k)), float(x)) for (i, j, k), x in zip(cells, lengths, strict=True)
-    ]
+    common, _, _ = _crossed(T[:3, 3], middle, 0.0, apart, voxel_size)
     return Group(common, cast(depth_m, T, camera, voxel_size, noise, max_depth, apart))
 
 
@@ -93,8 +89,7 @@ def cast(
         direction = T[:3, :3] @ directions[v, u]
         last = float(noise.depth_of_deviation(measured, -END_SIGMAS))
         end = min(last, max_depth)
-        cells, near, far = segments(T[:3, 3], direction, begin, end, voxel_size)
-        lengths = (far - near) * np.linalg.norm(direction) / voxel_size
+        crossed, near, far = _crossed(T[:3, 3], direction, begin, end, voxel_size)
         centre = 0.5 * (near + far)
         density = np.where(
             noise.sigma_at(centre) < voxel_size,
@@ -105,10 +100,18 @@ def cast(
         if end < last:
             likeliest = max(end, float(noise.depth_of_deviation(measured, 0.0)))
             beyond = float(noise.density_at(measured, likeliest))
-        voxels = [(int(i), int(j), int(k)) for i, j, k in cells]
-        whole = [Segment(*each) for each in zip(voxels, lengths.tolist(), strict=True)]
-        rays.append(Ray(whole, density.tolist(), beyond))
+        rays.append(Ray(crossed, density.tolist(), beyond))
     return rays
+
+
+def _crossed(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], begin: float, end: float, voxel_size: float
+) -> tuple[list[Segment], NDArray[np.float64], NDArray[np.float64]]:
+    """The segments of a ray, and the depths at which they begin and end."""
+    cells, near, far = segments(origin, direction, begin, end, voxel_size)
+    lengths = (far - near) * np.linalg.norm(direction) / voxel_size
+    voxels = [(int(i), int(j), int(k)) for i, j, k in cells]
+    return [Segment(*each) for each in zip(voxels, lengths.tolist(), strict=True)], near, far
 
 
 def logit(p: float) -> float:
