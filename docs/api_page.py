@@ -5,7 +5,9 @@ site.py adds the page; the plugin mkdocstrings replaces each ``:::`` block by th
 
 import importlib
 import inspect
+import re
 import typing
+from pathlib import Path
 
 import taichi_mrf
 
@@ -45,8 +47,16 @@ GROUPS: dict[str, tuple[str, ...]] = {
 INTRODUCTION = f"""# Python API
 
 Everything on this page is imported from `taichi_mrf`; the examples write `import taichi_mrf as tm`.
-`tm.__version__` is the version, {taichi_mrf.__version__} here. [Queries](queries.md) has an example
-of each query, and [Parameters](parameters.md) lists every field of the configuration.
+`tm.__version__` is the version, {taichi_mrf.__version__} here. The examples, read from top to bottom, are
+one program, which begins with
+
+```python
+import numpy as np
+
+import taichi_mrf as tm
+```
+
+[Queries](queries.md) and [Parameters](parameters.md) explain more.
 """
 
 RESULTS = """
@@ -60,18 +70,35 @@ The other exceptions are in `taichi_mrf.errors`. All of them derive from `Taichi
 """
 
 
+EXAMPLES = Path(__file__).with_name("api_examples.py")
+
+
+def examples() -> dict[str, str]:
+    """The section of EXAMPLES that shows each public name."""
+    parts = re.split(r"^# ((?:tm\.\w+,? ?)+)$", EXAMPLES.read_text(encoding="utf-8"), flags=re.M)
+    found = {}
+    for names, code in zip(parts[1::2], parts[2::2], strict=True):
+        *others, last = re.findall(r"\w+(?=,|$)", names)
+        found |= dict.fromkeys(others, "") | {last: f"```python\n{code.strip()}\n```\n"}
+    return found
+
+
 def api_page() -> str:
-    """The page as Markdown. Raises ValueError if GROUPS and the public names differ."""
+    """The page as Markdown. Raises ValueError if GROUPS, EXAMPLES and the public names differ."""
     grouped = {name for names in GROUPS.values() for name in names}
     public = set(taichi_mrf.__all__) - {"__version__"}
     if grouped != public:
         raise ValueError(
             f"docs/api_page.py: GROUPS and taichi_mrf.__all__ differ: {sorted(grouped ^ public)}"
         )
+    shown = examples()
+    if set(shown) != public:
+        raise ValueError(f"{EXAMPLES}: has not one section for each of: {sorted(set(shown) ^ public)}")
     parts = [INTRODUCTION]
     for title, names in GROUPS.items():
         parts.append(f"## {title}\n")
-        parts += [f"::: {_home(name)}.{name}\n" for name in names]
+        for name in names:
+            parts += [f"::: {_home(name)}.{name}\n", shown[name]]
     parts.append(OTHER_ERRORS)
     parts += [f"::: taichi_mrf.errors.{name}\n" for name in _other_errors()]
     parts.append(RESULTS)

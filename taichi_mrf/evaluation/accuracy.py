@@ -148,15 +148,9 @@ class JudgedView:
         return float(np.mean(self.log_densities())) if self.measured.any() else float("nan")
 
     def log_densities(self) -> NDArray[np.float64]:
-        """The log density of each measurement, row by row, (n,).
-
-        A share OUTLIERS of the measurements, and what is left of a ray that leaves the map, may come from
-        anywhere in the sensor's range, so one pixel cannot cost more than log(OUTLIERS / range).
-        """
-        survey, anywhere = self.survey, 1.0 / self.max_depth
-        through = survey.visibility[self.measured].astype(np.float64)
-        explained = survey.likelihood[self.measured] + through * anywhere
-        return np.asarray(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere))
+        """:func:`log_density` of each measurement, row by row, (n,)."""
+        survey, measured = self.survey, self.measured
+        return log_density(survey.likelihood[measured], survey.visibility[measured], self.max_depth)
 
     def _within(self, tolerance: Tolerance) -> NDArray[np.bool_]:
         depth, answer = self.depth_m.astype(np.float64), self.survey.middle.astype(np.float64)
@@ -171,6 +165,20 @@ class JudgedView:
             sigma, bias = self.noise.at_pixels(answer)
             return np.abs(self.measured_m - answer - bias) <= 1.5 * sigma
         raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
+
+
+def log_density(
+    likelihood: NDArray[np.float32], visibility: NDArray[np.float32], max_depth: float
+) -> NDArray[np.float64]:
+    """The log density, per metre, of measurements from their ``likelihood`` under the map and the
+    ``visibility`` of their rays at the end.
+
+    A share OUTLIERS of the measurements, and what is left of a ray that leaves the map, may come from
+    anywhere in the sensor's range, so one pixel cannot cost more than log(OUTLIERS / range).
+    """
+    anywhere = 1.0 / max_depth
+    explained = likelihood + visibility.astype(np.float64) * anywhere
+    return np.asarray(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere))
 
 
 def judge_view(

@@ -22,13 +22,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.accuracy import log_density
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.log_odds import exp_of_negative
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template
+from taichi_mrf.queries.survey import OPAQUE, Medium, occlusion, stopped_share
+from taichi_mrf.queries.view import viewed_box
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.forward import SEGMENT
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, unwidened_noise
-from taichi_mrf.voxels.traversal import FAR
+from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 OCTAVES = np.arange(-3.0, 5.01, 0.5)
 """Binary logarithms of the factors on sigma that are tried."""
@@ -100,21 +110,106 @@ def explained(
     pixels = np.flatnonzero((depth_m > 0) & (depth_m <= m.sensor.max_depth))
     if not len(pixels) or not isinstance(table, NoiseTable):
         return None
-    some = np.zeros_like(depth_m)
     # Evenly over the image, but not in columns: a stride that divides the width would make some.
-    kept = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), PIXELS)).astype(np.int64)]
+    kept = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), PIXELS)).astype(np.int64)].astype(np.int32)
+    some = np.zeros_like(depth_m)
     some.flat[kept] = depth_m.flat[kept]
     measured = some > 0
-    # A doubt in the map would bear a part of what sigma has to.
-    trusting = m.view.with_occlusion(least=-FAR, most=FAR)
-    densities = []
-    for octave in OCTAVES:
-        noise_there = _Multiple(table, 2.0**octave)
-        view = judge_view(m, some, T_world_camera, camera, noise=noise_there, view=trusting)
-        densities.append(view.log_densities())
     sigma_m = table.at_pixels(some)[0][measured]
     stated_m = sigma_m if stated is None else stated.table(camera).at_pixels(some)[0][measured]
-    return Explained(sigma_m, stated_m, np.stack(densities, axis=1), VOXEL_SPREAD * m.voxel_size)
+    densities = _log_densities(m, kept, depth_m.flat[kept], as_pose(T_world_camera), camera, table)
+    return Explained(sigma_m, stated_m, densities, VOXEL_SPREAD * m.voxel_size)
+
+
+def _log_densities(
+    m: VoxelMap,
+    pixels: NDArray[np.int32],
+    depth_m: NDArray[np.float32],
+    T_world_camera: Pose,
+    camera: Camera,
+    noise: NoiseTable,
+) -> NDArray[np.float64]:
+    """The log density of the measurements of some pixels (n,) under each multiple of sigma, (n, OCTAVES)."""
+    view, reach_m = m.view, m.sensor.max_depth
+    density, visibility = np.zeros((len(pixels), len(OCTAVES)), np.float32), np.ones(len(pixels), np.float32)
+    window = view.fill(np.stack(viewed_box(camera, T_world_camera, reach_m)))
+    if window is not None:
+        # A doubt in the map would bear a part of what sigma has to.
+        medium = Medium(m.voxel_size, reach_m, -FAR, replace(view.predicting, least=-FAR, most=FAR))
+        _explain_rays(
+            noise.sensor(camera), window[0].viewpoint(T_world_camera),
+            view.index.space(window[0], view.volume.lower, view.volume.upper), view.pool.belief, medium,
+            pixels, depth_m, (2.0**OCTAVES).astype(np.float32), _Densities(density, visibility),
+        )  # fmt: skip
+        view.index.clear(*window)
+        runtime.settle()
+    return log_density(density, visibility[:, None], reach_m)
+
+
+@dataclass(frozen=True)
+class _Densities(Bundle):
+    """Output of :func:`_explain_rays`: the ``density`` (n, OCTAVES), per metre, of each measurement under
+    each multiple of sigma, if the surface is distributed as the map has it, and the ``visibility`` (n) of the
+    ray at its end."""
+
+    density: F32Array2
+    visibility: F32Array
+
+
+@dataclass(frozen=True)
+class _Explaining(Bundle):
+    """Inputs of a step along ray ``i`` of :func:`_explain_rays`."""
+
+    belief: F32Array
+    medium: Medium
+    sensor: Sensor
+    noise: Template  # of the ray's pixel
+    factors: F32Array
+    measured: F32
+    voxels_per_depth: F32
+    i: I32
+    out: _Densities
+
+
+@ti.dataclass
+class _Seen(Struct):
+    """What is left of a ray."""
+
+    visibility: F32
+
+
+@ti.func
+def _explain_voxel(ray: Template, given: Template, voxel: I32, near: F32, far: F32) -> I32:
+    """One voxel of a ray, as survey.survey_voxel has it."""
+    thickness = occlusion(given.belief[voxel], given.medium.occlusion) * (far - near) * given.voxels_per_depth
+    here = ray.visibility * stopped_share(thickness)
+    ray.visibility *= exp_of_negative(-thickness)
+    noise = given.noise
+    for k in range(given.factors.shape[0]):
+        noise.sigma_terms = given.factors[k] * given.noise.sigma_terms
+        given.out.density[given.i, k] += here * given.sensor.likelihood(
+            given.measured, near, far, noise, given.medium.voxel_size, SEGMENT
+        )
+    return ti.cast(ray.visibility > OPAQUE, ti.i32)
+
+
+@kernel
+def _explain_rays(
+    sensor: Sensor, view: Viewpoint, space: Space, belief: F32Array, medium: Medium,
+    pixels: I32Array, measured: F32Array, factors: F32Array, out: _Densities,
+) -> None:  # fmt: skip
+    """Follow the rays of some ``pixels`` (n), which ``measured`` (n) metres."""
+    for i in range(pixels.shape[0]):
+        u, v = sensor.pixel(pixels[i])
+        path = pixel_ray(sensor, view, u, v)
+        begin, end = 0.0, medium.max_depth
+        clip(path, begin, end, space.lower, space.upper)
+        given = _Explaining(
+            belief, medium, sensor, sensor.noise_at(u, v), factors, measured[i], path.direction.norm(), i, out
+        )
+        ray = _Seen(1.0)
+        walk_voxels(path, begin, end, space, _explain_voxel, ray, given)
+        out.visibility[i] = ray.visibility
 
 
 def pooled(parts: Iterable[Explained | None]) -> Explained | None:
@@ -168,20 +263,6 @@ def _improved(law: SigmaLaw, mean: Callable[[SigmaLaw], float]) -> SigmaLaw:
         else:
             step **= 0.5
     return law
-
-
-@dataclass(frozen=True)
-class _Multiple:
-    """The noise of a table with a multiple of its sigma."""
-
-    of: NoiseTable
-    factor: float
-
-    def table(self, camera: Camera) -> NoiseTable:
-        """The table of the one camera that it is for."""
-        coefficients = self.of.coefficients.copy()
-        coefficients[:, 0] *= self.factor
-        return replace(self.of, coefficients=coefficients)
 
 
 MOST_FRAMES = 8

@@ -10,17 +10,21 @@ from numpy.typing import NDArray
 from taichi_mrf import open_dataset
 from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig
 from taichi_mrf.datasets import Dataset
+from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.noise_fit import (
     LEAST_PIXELS,
     OCTAVES,
     Explained,
     NoiseCheck,
     check_noise,
+    explained,
     pooled,
     sigma_factor,
     sigma_law,
 )
 from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.traversal import FAR
 
 N = 20_000
 STEP = 2.0 ** (1 / 16)
@@ -102,6 +106,23 @@ def checked(room: Dataset, scale: float) -> NoiseCheck:
     assert check is not None
     assert check.frames == len(result.held_out) == 4
     return check
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_each_multiple_of_sigma_explains_measurements_as_a_noise_of_its_own(room: Dataset) -> None:
+    result = map_sequence(room, Config(0.05, evaluation=EvaluationConfig(hold_out=4)))
+    m, frame = result.map, room.read(result.held_out[0])
+    kept = np.zeros_like(frame.depth_m)
+    kept[::4, ::4] = frame.depth_m[::4, ::4]
+    sigma = (0.002, 0.001, 0.002)
+    found = explained(m, kept, frame.T_world_camera, frame.camera, PolynomialNoise(sigma))
+    assert found is not None
+    trusting = m.view.with_occlusion(least=-FAR, most=FAR)
+    for k, octave in enumerate(OCTAVES):
+        noise = PolynomialNoise(2.0**octave * np.array(sigma))
+        view = judge_view(m, kept, frame.T_world_camera, frame.camera, noise=noise, view=trusting)
+        # Tails of the normal distribution are exact to 1e-7 (sensor.forward), whose logarithm says more.
+        np.testing.assert_allclose(found.log_likelihood[:, k], view.log_densities(), rtol=0, atol=2e-3)
 
 
 @pytest.mark.usefixtures("one_backend")
