@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.resident import Resident, on_host, resident
+from taichi_mrf.kernels.resident import Resident, on_host, resident, unfilled
 from taichi_mrf.kernels.types import I32, F32Array, I32Array
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
@@ -19,6 +19,10 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
+
+
+LEAST_DEPTH_M = float(np.finfo(np.float32).smallest_subnormal)
+"""The smallest depth that is positive."""
 
 
 def checked_depth(depth_m: ArrayLike, camera: Camera, min_depth: float) -> NDArray[np.float32]:
@@ -39,8 +43,10 @@ def checked_depth(depth_m: ArrayLike, camera: Camera, min_depth: float) -> NDArr
     with np.errstate(over="ignore"):
         measured = depth.astype(np.float32, copy=False)
     # NaN is never larger than anything.
-    valid = (depth >= min_depth) & (measured > 0) & (measured < np.inf)
-    return np.where(valid, measured, np.float32(0.0))
+    kept = np.where(depth >= max(min_depth, LEAST_DEPTH_M), measured, np.float32(0.0))
+    if kept.max(initial=0.0) == np.inf:
+        kept[kept == np.inf] = 0.0
+    return kept
 
 
 def checked_color(color: ArrayLike | None, camera: Camera) -> NDArray[np.uint8] | None:
@@ -189,8 +195,8 @@ class RayList(Bundle):
     def empty(rays: int, groups: int) -> "RayList":
         """A list with room for so many."""
         n, g = max(1, rays), max(1, groups)
-        blocks, group_blocks, first = (ti.ndarray(ti.i32, size) for size in (n, g, g + 1))
-        depth, last, support = (ti.ndarray(ti.f32, size) for size in (n, n, g))
+        blocks, group_blocks, first = (unfilled(np.int32, size) for size in (n, g, g + 1))
+        depth, last, support = (unfilled(np.float32, size) for size in (n, n, g))
         return RayList(blocks, depth, last, rays, group_blocks, first, support, groups, 1)
 
     @property

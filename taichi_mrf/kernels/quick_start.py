@@ -9,6 +9,9 @@ from its cache. Taichi 1.7.4 spends more than a third of that time on words:
 - For each function it looks through all modules for the one that defines it, to see whether it stands in a
   class. Here it looks at that line of the source.
 - For each call of a function it finds, cuts out and wraps the function's source. Here this is kept.
+
+For each array that is made, at any time, Taichi also formats the whole stack of calls, for a message of its
+debug mode. Here it does not.
 """
 
 import ast
@@ -37,6 +40,9 @@ def hasten() -> None:
         module.getsourcelines = functools.cache(module.getsourcelines)
         words = module.textwrap
         module.textwrap = SimpleNamespace(fill=functools.cache(words.fill), dedent=words.dedent)
+    arrays = compiler.arrays()
+    if hasattr(arrays, "get_traceback"):
+        arrays.get_traceback = str
 
 
 def _note(context: Any, node: ast.stmt | ast.expr) -> str:

@@ -1,4 +1,5 @@
-"""Arrays for kernels: those that the host fills once, and arrays of vectors that give their memory back.
+"""Arrays for kernels: those that are filled once, by the host or by a kernel, and arrays of vectors that give
+their memory back.
 
 Kernels read the first again and again without waiting for the host. The second are freed when Python collects
 them, as Taichi's arrays of scalars are.
@@ -8,7 +9,7 @@ import weakref
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from taichi_mrf.kernels.types import Vec4
 from taichi_mrf.system import compiler, runtime
@@ -26,6 +27,13 @@ def resident(values: NDArray[Any]) -> Resident:
     array = ti.ndarray(compiler.data_type(values.dtype), values.shape)
     array.from_numpy(values)
     return array
+
+
+def unfilled(dtype: DTypeLike, length: int) -> Resident:
+    """An array (length) for a kernel to fill. On a CPU it is NumPy's: Taichi's is filled with zeros."""
+    if runtime.active() == "cpu":
+        return np.empty(length, dtype)
+    return ti.ndarray(compiler.data_type(np.dtype(dtype)), length)
 
 
 def on_host(array: Resident) -> NDArray[Any]:

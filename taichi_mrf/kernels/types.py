@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     I64Array: TypeAlias = Any
     F64Array: TypeAlias = Any
     F32Array: TypeAlias = Any
+    I32Array2: TypeAlias = Any
     F32Array2: TypeAlias = Any
     F32Array3: TypeAlias = Any
     Vec4Array: TypeAlias = Any
@@ -63,6 +64,7 @@ else:
     I64Array = ti.types.ndarray(dtype=ti.i64, ndim=1)
     F64Array = ti.types.ndarray(dtype=ti.f64, ndim=1)
     F32Array = ti.types.ndarray(dtype=ti.f32, ndim=1)
+    I32Array2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
     F32Array2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
     F32Array3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
     Vec4Array = ti.types.ndarray(dtype=Vec4, ndim=1)

@@ -151,6 +151,11 @@ def decorators() -> Any:
     return _inner("lang.kernel_impl")
 
 
+def arrays() -> Any:
+    """The module of ``ti.Ndarray``."""
+    return _inner("lang._ndarray")
+
+
 def compilation_error() -> type[Exception]:
     """The exception for source that is not in the language."""
     return getattr(_inner("lang.exception"), f"{title()}CompilationError")

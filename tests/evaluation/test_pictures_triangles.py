@@ -9,6 +9,8 @@ from taichi_mrf.evaluation.pictures.viewpoint import backdrop
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 CAMERA = PinholeCamera(width=37, height=29, fx=30.0, fy=26.0, cx=17.2, cy=15.1)
 
 

@@ -14,6 +14,8 @@ from taichi_mrf.evaluation.pictures.room_views import (
 )
 from taichi_mrf.evaluation.pictures.viewpoint import backdrop
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 UP = np.array([0.0, 0.0, 1.0])
 WHITE = np.full(3, 255, np.uint8)
 

@@ -20,6 +20,7 @@ from taichi_mrf.inference.ray_list import (
     stride_metres,
 )
 from taichi_mrf.inference.ray_model import END_SIGMAS
+from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.forward import SUPPORT
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -48,14 +49,14 @@ Block = tuple[int, int, int, int]
 
 def blocks_of(rays: RayList, width: int) -> list[tuple[Block, float]]:
     """The block and the depth of each ray."""
-    depths = rays.depth.to_numpy()[: rays.number].tolist()
-    return list(zip(_unpacked(rays.blocks.to_numpy()[: rays.number], width), depths, strict=True))
+    depths = on_host(rays.depth)[: rays.number].tolist()
+    return list(zip(_unpacked(on_host(rays.blocks)[: rays.number], width), depths, strict=True))
 
 
 def groups_of(rays: RayList, width: int) -> list[tuple[Block, range]]:
     """The block of each group, and its rays."""
-    first = rays.first.to_numpy()[: rays.group_number + 1].tolist()
-    blocks = _unpacked(rays.groups.to_numpy()[: rays.group_number], width)
+    first = on_host(rays.first)[: rays.group_number + 1].tolist()
+    blocks = _unpacked(on_host(rays.groups)[: rays.group_number], width)
     return list(zip(blocks, map(range, first[:-1], first[1:]), strict=True))
 
 
@@ -131,7 +132,7 @@ def test_bundles_are_those_of_the_oracle(
     expected_groups = oracle(depth, wanted / 10, groups=True)
     assert len({block for block, _ in groups} ^ expected_groups.keys()) <= 0.02 * len(expected_groups)
     assert [i for _, members in groups for i in members] == list(range(rays.number))
-    last, support = rays.last.to_numpy(), rays.support.to_numpy()
+    last, support = on_host(rays.last), on_host(rays.support)
     for number, ((u0, v0, wide, high), members) in enumerate(groups):
         assert len(members) > 0
         for u, v, columns, rows in (listed_blocks[i] for i in members):

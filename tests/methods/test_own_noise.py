@@ -20,6 +20,7 @@ from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.ray_list import RayBundler, block_of
 from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.kernels.types import I32, AnyArray, I32Array
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.map_file import StoredKeyframe
@@ -106,7 +107,7 @@ def blocks(image: DepthImage) -> NDArray[np.int32]:
     """(n, 4): first column and row of each ray's block, its columns and rows."""
     rays = RayBundler(0.5, InferenceConfig(ray_density=0.02)).rays_of(image)
     out = np.zeros((rays.number, 4), np.int32)
-    _blocks(rays.blocks.to_numpy()[: rays.number], image.camera.width, out)
+    _blocks(on_host(rays.blocks)[: rays.number], image.camera.width, out)
     return out
 
 

@@ -1,16 +1,12 @@
 """Pictures from nothing but a list of voxels or of triangles: the first that each pixel of a camera sees,
 exactly, and light on it, so that its shape is legible and its colours still mean something.
 
-Independent of the map and its kernels, so pictures of any voxel list can be drawn, clipped or filtered, on
-any machine. Each voxel is tested (slab test) against the pixels of its projected bounding rectangle, near
-voxels first; a coarse depth pyramid drops those that are hidden (hierarchical z-buffer, Greene, Kass and
-Miller 1993), so a map of millions of voxels takes seconds in NumPy.
-
-Triangles are seen from the side from which they run counter-clockwise. Each is tested against the pixels of
-its projected bounding rectangle (edge functions, Pineda 1988), and the nearest wins.
+Independent of the map, so pictures of any voxel list can be drawn, clipped or filtered. Each shape is tested
+against the pixels of its projected bounding rectangle: voxels by slabs, triangles, which are seen from the
+side from which they run counter-clockwise, by edge functions (Pineda 1988). The nearest wins and, among
+equals, the one that comes first.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,21 +15,57 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array2, F32Array3, I32Array, I32Array2, Template
 from taichi_mrf.sensor.camera import PinholeCamera
-
-_BLOCK = 16
-"""Side in pixels of a block of the coarse depth image."""
-
-_VOXELS_AT_ONCE = 100_000
-_PAIRS_AT_ONCE = 200_000
-"""Bounds the memory of the slab tests to about 10 MB, which fit into the processor's caches."""
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.traversal import FAR
 
 _OVERLAP = 1e-5
 """How much larger the cubes are taken, relative to their size: rounding would let rays that run along
 a common face slip between its neighbours."""
 
-_NOTHING = np.uint64(0x7F800000FFFFFFFF)
-"""A depth of infinity (as float32 bits) and no voxel."""
+_NEAR_M = 0.01
+"""Triangles that reach nearer than this are left out."""
+
+_NONE = np.iinfo(np.int32).max
+"""In place of the number of a shape, and of the bits of a depth, where there is none."""
+
+
+@kernel
+def _draw(
+    shapes: Template, boxes: I32Array2, width: I32, depth: I32Array, index: I32Array, numbering: I32
+) -> None:
+    """First the least ``depth`` (H * W) that a shape has at each pixel, as the bits of a float32, which sort
+    like its value; then, with ``numbering``, the ``index`` (H * W) of the first shape that has it.
+
+    ``boxes`` (N, 4) are the first and last column and row of each shape; ``shapes.depth_at(i, u, v, pixel)``
+    is the axial depth at which a pixel's ray meets shape i, 0 where it does not.
+    """
+    for i in range(boxes.shape[0]):
+        for v in range(boxes[i, 2], boxes[i, 3] + 1):
+            for u in range(boxes[i, 0], boxes[i, 1] + 1):
+                pixel = v * width + u
+                met = shapes.depth_at(i, u, v, pixel)
+                if met > 0.0:
+                    bits = ti.bit_cast(met, ti.i32)
+                    if numbering == 0:
+                        ti.atomic_min(depth[pixel], bits)
+                    elif depth[pixel] == bits:
+                        ti.atomic_min(index[pixel], i)
+
+
+def _drawn(
+    shapes: "_Cubes | _Triangles", boxes: NDArray[np.int32], camera: PinholeCamera
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The depth at each pixel, (H * W), NaN where there is nothing, and the shape, -1 for none."""
+    depth, index = np.full((2, camera.width * camera.height), _NONE, np.int32)
+    if len(boxes):
+        for numbering in (0, 1):
+            _draw(shapes, boxes, camera.width, depth, index, numbering)
+    met = index < _NONE
+    depth_m = np.where(met, depth.view(np.float32), np.float32(np.nan))
+    return depth_m, np.where(met, index, -1).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -50,6 +82,33 @@ class VoxelImage:
     """Outward unit normal of the face that the ray enters, (H, W, 3), world frame, 0 where there is none."""
 
 
+@dataclass(frozen=True)
+class _Cubes(Bundle):
+    """Axis-aligned cubes of the world frame."""
+
+    relative: F32Array2
+    """(N, 3): their centres, from the camera's."""
+
+    inverse: F32Array2
+    """(H * W, 3): 1 over the direction of each pixel's ray, whose depth is 1."""
+
+    half: F32
+    """Half of their side."""
+
+    near_m: F32
+    """Depth at which rays begin."""
+
+    @ti.func
+    def depth_at(self, i: I32, u: I32, v: I32, pixel: I32) -> F32:
+        enter, leave = self.near_m, FAR
+        for axis in ti.static(range(3)):
+            middle = self.relative[i, axis] * self.inverse[pixel, axis]
+            reach = self.half * ti.abs(self.inverse[pixel, axis])
+            enter = ti.max(enter, middle - reach)
+            leave = ti.min(leave, middle + reach)
+        return enter if enter <= leave else 0.0
+
+
 def cast_voxels(
     centres: NDArray[np.floating],
     voxel_size: float,
@@ -64,40 +123,30 @@ def cast_voxels(
     """
     near_m = 0.5 * voxel_size
     half = near_m * (1.0 + _OVERLAP)
-    relative, pixel_box, nearest = _footprints(centres, half, camera, T_world_camera, near_m)
+    relative = (np.asarray(centres, np.float64) - T_world_camera[:3, 3]).astype(np.float32)
+    boxes = _boxes_of_cubes(relative, half, camera, T_world_camera, near_m)
+    seen = np.flatnonzero(boxes[:, 1] >= 0)
+    relative = relative[seen]
     # Directions with z = 1 in the camera frame, so that a ray's parameter is axial depth.
     directions = (camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T).astype(np.float32)
     directions[np.abs(directions) < 1e-12] = 1e-12
-    inverse = np.ascontiguousarray((1.0 / directions).T)
-    # One 64-bit word a pixel: the bits of a positive float32 sort like its value, so the least word is
-    # the nearest surface and, among equals, the voxel that comes first.
-    words = np.full(camera.width * camera.height, _NOTHING)
-    order = np.argsort(nearest)
-    order = order[np.isfinite(nearest[order])]
-    for start in range(0, order.size, _VOXELS_AT_ONCE):
-        voxels = order[start : start + _VOXELS_AT_ONCE]
-        voxels = voxels[~_hidden(pixel_box[voxels], nearest[voxels], _depth(words), camera)]
-        for voxel, pixel in pixels_of_rectangles(voxels, pixel_box, camera.width):
-            enter = np.full(voxel.size, near_m, np.float32)
-            leave = np.full(voxel.size, np.inf, np.float32)
-            for axis in range(3):
-                inverse_axis = inverse[axis, pixel]
-                middle, reach = relative[voxel, axis] * inverse_axis, half * np.abs(inverse_axis)
-                np.maximum(enter, middle - reach, out=enter)
-                np.minimum(leave, middle + reach, out=leave)
-            hit = enter <= leave
-            depth_bits = enter[hit].view(np.uint32).astype(np.uint64)
-            found = (depth_bits << np.uint64(32)) | voxel[hit].astype(np.uint64)
-            np.minimum.at(words, pixel[hit], found)
-    return _image(words, relative, directions, camera)
+    depth_m, index = _drawn(_Cubes(relative, 1.0 / directions, half, near_m), boxes[seen], camera)
+    # The face that each ray enters is the one that it is farthest out along.
+    met = index >= 0
+    offset = depth_m[met, None] * directions[met] - relative[index[met]]
+    axis = np.argmax(np.abs(offset), axis=1)
+    normal = np.zeros((depth_m.size, 3), np.float32)
+    normal[np.flatnonzero(met), axis] = np.sign(offset[np.arange(axis.size), axis])
+    index[met] = seen[index[met]]
+    shape = camera.shape
+    return VoxelImage(depth_m.reshape(shape), index.reshape(shape), normal.reshape(*shape, 3))
 
 
-def _footprints(
-    centres: NDArray[np.floating], half: float, camera: PinholeCamera, T_world_camera: Pose, near_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
-    """Centres relative to the camera (N, 3); the pixels that a voxel may cover, as the first and last
-    column and row (N, 4); and its nearest depth (N,), infinite where the camera cannot see it."""
-    relative = (np.asarray(centres, np.float64) - T_world_camera[:3, 3]).astype(np.float32)
+def _boxes_of_cubes(
+    relative: NDArray[np.float32], half: float, camera: PinholeCamera, T_world_camera: Pose, near_m: float
+) -> NDArray[np.int32]:
+    """The pixels that a cube may cover, as the first and last column and row (N, 4), -1 where the camera
+    cannot see it; ``relative`` (N, 3) are the centres from the camera's."""
     rotation = T_world_camera[:3, :3].astype(np.float32)
     x, y, z = (relative @ rotation).T
     reach_x, reach_y, reach_z = half * np.abs(rotation).sum(axis=0)
@@ -105,7 +154,7 @@ def _footprints(
     visible = nearest > near_m
     near = np.where(visible, nearest, np.float32(1.0))
     far = np.where(visible, farthest, np.float32(1.0))
-    box = np.empty((len(centres), 4), np.int32)
+    boxes = np.empty((len(relative), 4), np.int32)
     for column, coordinate, reach, focal, centre, size in (
         (0, x, reach_x, camera.fx, camera.cx, camera.width),
         (2, y, reach_y, camera.fy, camera.cy, camera.height),
@@ -114,77 +163,10 @@ def _footprints(
         first = np.ceil(focal * np.minimum(low / near, low / far) + centre - 1e-3)
         last = np.floor(focal * np.maximum(high / near, high / far) + centre + 1e-3)
         visible &= (last >= 0) & (first <= size - 1) & (first <= last)
-        box[:, column] = np.clip(first, 0, size - 1)
-        box[:, column + 1] = np.clip(last, 0, size - 1)
-    return relative, box, np.where(visible, nearest, np.float32(np.inf))
-
-
-def _depth(words: NDArray[np.uint64]) -> NDArray[np.float32]:
-    """The depth half of the pixels' words; infinite where no voxel was met yet."""
-    return (words >> np.uint64(32)).astype(np.uint32).view(np.float32)
-
-
-def _hidden(
-    box: NDArray[np.int32],
-    nearest: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    camera: PinholeCamera,
-) -> NDArray[np.bool_]:
-    """Which voxels lie wholly behind what every block of pixels that they touch already shows, (N,)."""
-    rows, columns = -(-camera.height // _BLOCK), -(-camera.width // _BLOCK)
-    padded = np.zeros((rows * _BLOCK, columns * _BLOCK), np.float32)
-    padded[: camera.height, : camera.width] = depth.reshape(camera.shape)
-    farthest = padded.reshape(rows, _BLOCK, columns, _BLOCK).max(axis=(1, 3))
-    u0, u1, v0, v1 = (box // _BLOCK).T
-    small = (u1 - u0 <= 1) & (v1 - v0 <= 1)  # then the four corners name all blocks that it touches
-    corners = [farthest[v, u] for v in (v0, v1) for u in (u0, u1)]
-    return small & (nearest > np.maximum.reduce(corners))
-
-
-def pixels_of_rectangles(
-    voxels: NDArray[np.intp], box: NDArray[np.int32], width: int
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """All (voxel, pixel) pairs of the rectangles of some voxels, (P,) each, some at a time; ``box`` (N, 4)
-    has the first and last column and row of each."""
-    u0, u1, v0, v1 = box[voxels].T.astype(np.intp)
-    widths = u1 - u0 + 1
-    counts = widths * (v1 - v0 + 1)
-    ends = np.cumsum(counts)
-    start = 0
-    while start < voxels.size:
-        done = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, done + _PAIRS_AT_ONCE, side="right")))
-        part = slice(start, stop)
-        owner = np.repeat(np.arange(start, stop), counts[part])
-        offset = np.arange(done, ends[stop - 1]) - (ends - counts)[owner]
-        row, column = np.divmod(offset, widths[owner])
-        yield voxels[owner], (v0[owner] + row) * width + u0[owner] + column
-        start = stop
-
-
-def _image(
-    words: NDArray[np.uint64],
-    relative: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    camera: PinholeCamera,
-) -> VoxelImage:
-    """Unpack the words and find the face that each ray enters."""
-    depth = _depth(words)
-    met = np.isfinite(depth)
-    index = np.where(met, (words & np.uint64(0xFFFFFFFF)).astype(np.int64), -1)
-    offset = depth[met, None] * directions[met] - relative[index[met]]
-    axis = np.argmax(np.abs(offset), axis=1)
-    normal = np.zeros((depth.size, 3), np.float32)
-    normal[np.flatnonzero(met), axis] = np.sign(offset[np.arange(axis.size), axis])
-    return VoxelImage(
-        depth_m=np.where(met, depth, np.float32(np.nan)).reshape(camera.shape),
-        index=index.reshape(camera.shape),
-        normal=normal.reshape(*camera.shape, 3),
-    )
-
-
-_NEAR_M = 0.01
-"""A depth of infinity (as float32 bits) and no triangle."""
+        boxes[:, column] = np.clip(first, 0, size - 1)
+        boxes[:, column + 1] = np.clip(last, 0, size - 1)
+    boxes[~visible] = -1
+    return boxes
 
 
 @dataclass(frozen=True)
@@ -195,6 +177,30 @@ class TriangleImage:
     depth_m: NDArray[np.float32]
     index: NDArray[np.int64]
     shares: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Triangles(Bundle):
+    """Triangles on the screen."""
+
+    corners: F32Array3
+    """(T, 3, 3): column and row of each corner, in pixels, and 1 over its depth, which is linear there."""
+
+    @ti.func
+    def depth_at(self, i: I32, u: I32, v: I32, pixel: I32) -> F32:
+        away = ti.Matrix.zero(ti.f32, 3, 2)
+        for corner in ti.static(range(3)):
+            away[corner, 0] = self.corners[i, corner, 0] - u
+            away[corner, 1] = self.corners[i, corner, 1] - v
+        # Twice the areas opposite to the corners, negative inside: rows grow downwards.
+        area, nearness, outermost = 0.0, 0.0, -FAR
+        for corner in ti.static(range(3)):
+            a, b = (corner + 1) % 3, (corner + 2) % 3
+            opposite = away[a, 0] * away[b, 1] - away[a, 1] * away[b, 0]
+            area += opposite
+            nearness += opposite * self.corners[i, corner, 2]
+            outermost = ti.max(outermost, opposite)
+        return area / nearness if outermost <= 0.0 and area < 0.0 else 0.0
 
 
 def cast_triangles(
@@ -208,49 +214,34 @@ def cast_triangles(
     T = inverse(T_world_camera)
     x, y, depth = (np.asarray(vertices_m, np.float64) @ T[:3, :3].T + T[:3, 3]).T
     ahead = np.maximum(depth, _NEAR_M)
-    u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
-    corners = np.stack([u[triangles], v[triangles]], axis=-1)
-    # Rows grow downwards, so counter-clockwise triangles have a negative area in pixels.
-    edges = corners[:, 1:] - corners[:, :1]
-    area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    first, last = np.ceil(corners.min(axis=1)), np.floor(corners.max(axis=1))
-    size = np.array([camera.width, camera.height])
-    seen = (area < 0) & (depth[triangles] > _NEAR_M).all(axis=1)
+    points = np.stack([camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy, 1.0 / ahead], 1)
+    corners = points.astype(np.float32)[triangles]
+    first, last = np.ceil(corners[..., :2].min(axis=1)), np.floor(corners[..., :2].max(axis=1))
+    size = np.array([camera.width, camera.height], np.float32)
+    seen = (depth > _NEAR_M)[triangles].all(axis=1)
     seen &= (first <= last).all(axis=1) & (last >= 0).all(axis=1) & (first < size).all(axis=1)
+    seen &= _twice_areas(corners) < 0
     rows = np.flatnonzero(seen)
-    bounds = np.clip(np.stack([first[rows], last[rows]], axis=1), 0, size - 1).astype(np.int32)
-    box = bounds.transpose(0, 2, 1).reshape(-1, 4)
-    words = np.full(camera.width * camera.height, _NOTHING)
-    for place, pixel in pixels_of_rectangles(np.arange(len(rows)), box, camera.width):
-        row = rows[place]
-        shares = _shares(corners[row], area[row], pixel, camera.width)
-        inside = (shares >= 0).all(axis=1)
-        row, pixel = row[inside], pixel[inside]
-        nearness = (shares[inside] / depth[triangles[row]]).sum(axis=1)
-        bits = (1.0 / nearness).astype(np.float32).view(np.uint32).astype(np.uint64)
-        np.minimum.at(words, pixel, (bits << np.uint64(32)) | row.astype(np.uint64))
-    found = (words >> np.uint64(32)).astype(np.uint32).view(np.float32)
-    met = np.flatnonzero(np.isfinite(found))
-    index = np.full(words.shape, -1, np.int64)
-    index[met] = (words[met] & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    seen_shares = np.zeros((len(words), 3), np.float32)
+    bounds = np.clip(np.stack([first[rows], last[rows]], axis=2), 0, size[:, None] - 1)
+    corners = corners[rows]
+    depth_m, index = _drawn(_Triangles(corners), bounds.astype(np.int32).reshape(-1, 4), camera)
+    met = np.flatnonzero(index >= 0)
+    there = corners[index[met]]
+    there[..., :2] -= np.stack([met % camera.width, met // camera.width], axis=1)[:, None]
     # Shares on the screen become shares in space: nearer corners count more.
-    near = _shares(corners[index[met]], area[index[met]], met, camera.width) / depth[triangles[index[met]]]
-    seen_shares[met] = near / near.sum(axis=1, keepdims=True)
-    depth_m = np.where(np.isfinite(found), found, np.float32(np.nan)).reshape(camera.shape)
-    return TriangleImage(depth_m, index.reshape(camera.shape), seen_shares.reshape(*camera.shape, 3))
+    x, y, nearness = there.transpose(2, 1, 0)
+    near = nearness * np.stack([x[a] * y[b] - x[b] * y[a] for a, b in ((1, 2), (2, 0), (0, 1))])
+    shares = np.zeros((len(index), 3), np.float32)
+    shares[met] = (near / near.sum(axis=0)).T
+    index[met] = rows[index[met]]
+    shape = camera.shape
+    return TriangleImage(depth_m.reshape(shape), index.reshape(shape), shares.reshape(*shape, 3))
 
 
-def _shares(
-    corners: NDArray[np.float64], area: NDArray[np.float64], pixel: NDArray[np.integer], width: int
-) -> NDArray[np.float64]:
-    """The shares of the corners (n, 3, 2) of triangles at pixels (n,), on the screen: (n, 3)."""
-    row, column = np.divmod(pixel, width)
-    away = corners - np.stack([column, row], axis=1)[:, None]
-    opposite = [
-        away[:, a, 0] * away[:, b, 1] - away[:, a, 1] * away[:, b, 0] for a, b in ((1, 2), (2, 0), (0, 1))
-    ]
-    return np.stack(opposite, axis=1) / area[:, None]
+def _twice_areas(corners: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Twice the area of triangles (T, 3, 3) on the screen, negative where they run counter-clockwise."""
+    (x, y), (u, v) = ((corners[:, k, :2] - corners[:, 0, :2]).T for k in (1, 2))
+    return x * v - y * u
 
 
 _AMBIENT = 0.62

@@ -39,8 +39,8 @@ _BORDER_PASSES = 4
 
 @dataclass(frozen=True)
 class DrawnSurface:
-    """A surface to draw, world frame, metres: ``vertices_m`` (V, 3), ``triangles`` (T, 3), at least one,
-    ``normals`` (V, 3) and ``colors`` (V, 3) RGB, None to colour it by height."""
+    """A surface to draw, world frame, metres: ``vertices_m`` (V, 3) with smooth borders, at least one of
+    ``triangles`` (T, 3), ``normals`` (V, 3) and ``colors`` (V, 3) RGB, None to colour it by height."""
 
     vertices_m: NDArray[np.floating]
     triangles: NDArray[np.integer]
@@ -52,7 +52,7 @@ def surface_view(surface: DrawnSurface, voxel_size: float, up: NDArray[np.float6
     """The surface under a light, in the colours that cameras saw if voxels are small enough, else by height;
     what faces away from the viewer is not seen."""
     triangles = surface.triangles
-    vertices_m = smooth_borders(surface.vertices_m, triangles)
+    vertices_m = surface.vertices_m
     pose = overview_pose(vertices_m, surface.normals, up, PERSPECTIVE, voxel_size)
     camera = PERSPECTIVE.scaled(OVERSAMPLING)
     image = cast_triangles(vertices_m, triangles, camera, pose)
@@ -92,7 +92,7 @@ _SURFACE = "the measured surface"
 
 @dataclass(frozen=True)
 class DrawnMap:
-    """Parts of a map that are drawn, world frame, metres. At least one voxel."""
+    """Parts of a map that are drawn, world frame, metres. At least one voxel, unless its surface is drawn."""
 
     centres: NDArray[np.floating]
     """Centres of the occupied voxels, (N, 3)."""
@@ -157,7 +157,7 @@ def _surface_from_above(
     surface: DrawnSurface, room: DrawnMap, camera: PinholeCamera, pose: Pose
 ) -> tuple[NDArray[np.uint8], float]:
     """Picture of the surface from above and its range of heights; what was seen from below faces away."""
-    triangles, vertices_m = surface.triangles, smooth_borders(surface.vertices_m, surface.triangles)
+    triangles, vertices_m = surface.triangles, surface.vertices_m
     colors, height_range = height_colors(vertices_m @ room.up, room.voxel_size)
     image = cast_triangles(vertices_m, triangles, camera, pose)
     picture = shaded_triangles(image, triangles, colors, surface.normals, _light(room.up), _white(camera))

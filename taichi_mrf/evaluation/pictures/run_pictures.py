@@ -12,6 +12,7 @@ from taichi_mrf.evaluation.pictures.room_views import (
     DrawnMap,
     DrawnSurface,
     perspective,
+    smooth_borders,
     surface_view,
     top_view,
 )
@@ -34,6 +35,7 @@ _DIFFERENCE_RANGE_CM = 10.0
 _NO_DEPTH_GREY = "0.88"
 
 _LABELS = "depth (m); grey: none", "rendered − measured (cm)"
+NOTHING = np.zeros((0, 3))
 _LOW = 0.5
 """Height over width of pictures beside which the labels have no room."""
 
@@ -55,21 +57,23 @@ def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) ->
 
 def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
     """The views of the whole map, by file name."""
-    keyframes = list(m.keyframes.values())
-    seen = seen_surfaces(m)
-    up = up_direction(map(upward_axis, keyframes), seen.normals, m.up or Z_UP)
+    cameras = list(m.keyframes.values())
+    poses, upwards = [each.T_world_camera for each in cameras], [upward_axis(each) for each in cameras]
     surface = m.surface() if measures_surface(m) and m.has_surface else None
-    views, drawn = {}, None
     if surface is not None and len(surface.triangles):
-        drawn = DrawnSurface(surface.vertices_m, surface.triangles, surface.normals, surface.colors)
-        views["surface.png"] = surface_view(drawn, m.voxel_size, up)
+        up = up_direction(upwards, surface.normals, m.up or Z_UP)
+        vertices_m = smooth_borders(surface.vertices_m, surface.triangles)
+        drawn = DrawnSurface(vertices_m, surface.triangles, surface.normals, surface.colors)
+        room = DrawnMap(NOTHING, NOTHING, m.voxel_size, up, poses)
+        return {"surface.png": surface_view(drawn, m.voxel_size, up), "top_view.png": top_view(room, drawn)}
     centres, _ = m.decided.voxels(min_probability=0.5)
     if len(centres) == 0:
         nothing = notice("The map holds no occupied voxel.")
-        return {**(views or {"perspective.png": nothing}), "top_view.png": nothing}
-    normals = seen.thickened().normals_at(centres)
-    room = DrawnMap(centres, normals, m.voxel_size, up, [each.T_world_camera for each in keyframes])
-    return {**(views or {"perspective.png": perspective(room)}), "top_view.png": top_view(room, drawn)}
+        return {"perspective.png": nothing, "top_view.png": nothing}
+    seen = seen_surfaces(m)
+    up = up_direction(upwards, seen.normals, m.up or Z_UP)
+    room = DrawnMap(centres, seen.thickened().normals_at(centres), m.voxel_size, up, poses)
+    return {"perspective.png": perspective(room), "top_view.png": top_view(room)}
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
