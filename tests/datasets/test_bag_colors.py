@@ -1,12 +1,11 @@
 """Colour topics of bags: registered to depth, of a camera of their own, and those that cannot be used."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from inputs_bags import CAMERA, COUNT, FRAME, Bag, plain, stamp, steps
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, Make, plain, stamp, steps
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
@@ -50,14 +49,14 @@ def beside(bag: Bag, info: bool = True, tf: bool = True) -> None:
 
 
 @pytest.mark.parametrize("write", [registered, lambda bag: registered(bag, "bgra8"), compressed])
-def test_registered_colours_come_back(make: Callable[..., Path], write: Callable[[Bag], None]) -> None:
+def test_registered_colours_come_back(make: Make, write: Callable[[Bag], None]) -> None:
     dataset = open_dataset(make(plain, write, kind="mcap"))
     for i in (2, 0, 4):
         np.testing.assert_array_equal(dataset.read(i).color, picture(i))
     assert any(note == f"color: {TOPIC}, registered to depth" for note in dataset.notes)
 
 
-def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(make: Callable[..., Path]) -> None:
+def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(make: Make) -> None:
     dataset = open_dataset(make(plain, beside))
     own = ColorCamera(OWN, inverse(T_depth_color))
     for i in range(COUNT):
@@ -80,7 +79,7 @@ def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(make: Callable[..., 
     ],
 )
 def test_colours_that_cannot_be_used_are_named(
-    make: Callable[..., Path], write: Callable[[Bag], None], problem: str
+    make: Make, write: Callable[[Bag], None], problem: str
 ) -> None:
     dataset = open_dataset(make(plain, write))
     assert dataset.read(0).color is None
@@ -88,7 +87,7 @@ def test_colours_that_cannot_be_used_are_named(
     assert problem in note
 
 
-def test_a_colour_topic_can_be_chosen_and_must_be_one(make: Callable[..., Path]) -> None:
+def test_a_colour_topic_can_be_chosen_and_must_be_one(make: Make) -> None:
     def two(bag: Bag) -> None:
         registered(bag)
         bag.image("/left", 1.0, FRAME, picture(7), "bgr8")

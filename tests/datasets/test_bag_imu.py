@@ -1,12 +1,9 @@
 """IMUs of bags: turns and the first image's level in the camera's frame, and topics that cannot be used."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-from inputs_bags import FRAME, Bag, Kind, images, stamp
+from inputs_bags import FRAME, Bag, Kind, Make, images, stamp
 from refusals import refused
 
 from taichi_mrf.alignment.se3 import moved
@@ -53,9 +50,7 @@ def imu(
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_turns_come_in_the_cameras_frame_and_the_first_image_is_level(
-    make: Callable[..., Path], kind: Kind
-) -> None:
+def test_turns_come_in_the_cameras_frame_and_the_first_image_is_level(make: Make, kind: Kind) -> None:
     dataset = open_dataset(f"{make(images, imu, kind=kind)}?poses=track")
     first, second = dataset.read(0), dataset.read(1)
     assert second.gyro is not None
@@ -69,7 +64,7 @@ def test_turns_come_in_the_cameras_frame_and_the_first_image_is_level(
     assert any(f"{TOPIC} measures turns; the first image is level" in note for note in dataset.notes)
 
 
-def test_what_shakes_does_not_say_which_way_is_up(make: Callable[..., Path]) -> None:
+def test_what_shakes_does_not_say_which_way_is_up(make: Make) -> None:
     dataset = open_dataset(f"{make(images, lambda bag: imu(bag, shake=2.0))}?poses=track")
     np.testing.assert_array_equal(dataset.read(0).T_world_camera, start_pose())
     assert any("which way is up it does not say" in note for note in dataset.notes)
@@ -78,7 +73,7 @@ def test_what_shakes_does_not_say_which_way_is_up(make: Callable[..., Path]) -> 
     np.testing.assert_allclose(upwards(np.tile([0.0, -GRAVITY, 0.0], (20, 1))), [0, -1, 0])
 
 
-def test_topics_that_cannot_be_used_are_named(make: Callable[..., Path]) -> None:
+def test_topics_that_cannot_be_used_are_named(make: Make) -> None:
     dataset = open_dataset(f"{make(images, lambda bag: imu(bag, tf=False))}?poses=track")
     assert dataset.read(0).gyro is None
     assert any(f"no fixed transform from {BODY!r} to {FRAME!r}" in note for note in dataset.notes)
@@ -89,7 +84,7 @@ def test_topics_that_cannot_be_used_are_named(make: Callable[..., Path]) -> None
     assert open_dataset(f"{both}?poses=track&imu=none").notes == []
 
 
-def test_accelerations_alone_are_no_turns(make: Callable[..., Path]) -> None:
+def test_accelerations_alone_are_no_turns(make: Make) -> None:
     path = make(images, lambda bag: imu(bag, covariance=-1.0))
     assert open_dataset(f"{path}?poses=track").read(0).gyro is None
     refused(f"{path}?poses=track&imu={TOPIC}", f"topic {TOPIC} has no angular rates")

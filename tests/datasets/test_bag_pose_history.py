@@ -1,6 +1,5 @@
 """The poses of a bag as they were known at a time: paths that are sent again, and transforms that jump."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from inputs_bags import (
     START,
     Bag,
     Kind,
+    Make,
     T_body_camera,
     images,
     mounted,
@@ -41,7 +41,7 @@ def assert_poses(found: ChangedPoses | None, wanted: dict[float, Pose]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
-def test_a_path_that_is_sent_again_corrects_earlier_poses(make: Callable[..., Path], kind: Kind) -> None:
+def test_a_path_that_is_sent_again_corrects_earlier_poses(make: Make, kind: Kind) -> None:
     first = {stamp(i): world_body(i) for i in range(2)}
     last = {stamp(i): offset(0.0, 0.3, 0.1 * i) @ world_body(i) for i in range(4)}
 
@@ -94,7 +94,7 @@ def test_a_transform_that_jumps_moves_all_earlier_poses(tmp_path: Path) -> None:
     assert_poses(earth, wanted)
 
 
-def test_a_topic_of_single_poses_does_not_change(make: Callable[..., Path]) -> None:
+def test_a_topic_of_single_poses_does_not_change(make: Make) -> None:
     source = open_pose_source(make(plain))
     assert_poses(source.poll(float("-inf")), {stamp(i): world_body(i) @ T_body_camera for i in range(COUNT)})
     assert source.poll(float("inf")) is None

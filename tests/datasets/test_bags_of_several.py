@@ -1,7 +1,6 @@
 """Bags of several robots, publishers, runs and sensors: told apart, or refused with what tells them apart."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from inputs_bags import (
     FRAME,
     Bag,
     Kind,
+    Make,
     T_body_camera,
     check_poses,
     images,
@@ -47,7 +47,7 @@ def moving(topic: str = "/tf", T: Pose = AWAY, parent: str = "odom", node: str =
     return write
 
 
-def test_each_robot_has_the_tree_of_its_namespace(make: Callable[..., Path]) -> None:
+def test_each_robot_has_the_tree_of_its_namespace(make: Make) -> None:
     def write(bag: Bag) -> None:
         for robot in ("/robot1", "/robot2"):
             images(bag, f"{robot}/depth/image_raw")
@@ -75,7 +75,7 @@ def test_each_robot_has_the_tree_of_its_namespace(make: Callable[..., Path]) -> 
     check_poses(open_dataset(f"{unplaced}?tf=/b"), AWAY)
 
 
-def test_publishers_that_disagree_are_chosen_among(make: Callable[..., Path]) -> None:
+def test_publishers_that_disagree_are_chosen_among(make: Make) -> None:
     path = make(images, mounted, moving(T=np.eye(4)), moving(node="/other"))
     refused(path, f"transforms of {BODY} in odom contradict each other", "?poses=FILE")
     named = make(images, mounted, moving(T=np.eye(4), node="/one"), moving(node="/two"))
@@ -89,14 +89,14 @@ def test_publishers_that_disagree_are_chosen_among(make: Callable[..., Path]) ->
     check_poses(open_dataset(elsewhere))
 
 
-def test_parents_that_differ_are_chosen_among_by_the_fixed_frame(make: Callable[..., Path]) -> None:
+def test_parents_that_differ_are_chosen_among_by_the_fixed_frame(make: Make) -> None:
     path = make(images, mounted, moving(T=np.eye(4)), moving(parent="vicon"))
     refused(path, f"{BODY} has several parents, odom, vicon", "?frame=odom or ?frame=vicon")
     check_poses(open_dataset(f"{path}?frame=vicon"), AWAY)
     check_poses(open_dataset(f"{path}?frame=odom"))
 
 
-def test_mountings_that_contradict_each_other_are_refused(make: Callable[..., Path]) -> None:
+def test_mountings_that_contradict_each_other_are_refused(make: Make) -> None:
     def again(bag: Bag) -> None:
         bag.tf("/tf_static", 0.0, BODY, FRAME, AWAY)
 
@@ -110,7 +110,7 @@ def test_mountings_that_contradict_each_other_are_refused(make: Callable[..., Pa
     check_poses(open_dataset(f"{path}?tf=last"))
 
 
-def test_a_topic_of_poses_of_two_bodies_is_refused_or_chosen(make: Callable[..., Path]) -> None:
+def test_a_topic_of_poses_of_two_bodies_is_refused_or_chosen(make: Make) -> None:
     def both(bag: Bag) -> None:
         for i in range(COUNT):
             bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
@@ -155,7 +155,7 @@ LONG = 16
     ("kind", "is_recorders"), [("ros1", False), ("ros1", True), ("sqlite", True), ("mcap", True)]
 )
 def test_a_clock_that_starts_again_begins_a_run(
-    make: Callable[..., Path], kind: Kind, is_recorders: bool, by_tf: bool
+    make: Make, kind: Kind, is_recorders: bool, by_tf: bool
 ) -> None:
     """The second run is shorter and elsewhere. Late transforms of the first arrive in it, or the recorder has
     the same clock."""
@@ -201,7 +201,7 @@ def two_cameras(bag: Bag) -> None:
 
 
 def test_sensors_that_share_a_topic_have_mountings_and_cameras_of_their_own(
-    make: Callable[..., Path],
+    make: Make,
 ) -> None:
     path = make(two_cameras, mounted, lambda bag: bag.tf("/tf_static", 0.0, BODY, "rear", T_body_rear))
     dataset = open_dataset(path)
@@ -215,7 +215,7 @@ def test_sensors_that_share_a_topic_have_mountings_and_cameras_of_their_own(
     check_poses(open_dataset(f"{one}?optical={FRAME}"))
 
 
-def test_lidars_that_share_a_topic_have_mountings_of_their_own(make: Callable[..., Path]) -> None:
+def test_lidars_that_share_a_topic_have_mountings_of_their_own(make: Make) -> None:
     def write(bag: Bag) -> None:
         for k in range(4):
             send(bag, stamp(k), points(k), frame=(LIDAR, "rear")[k % 2])
@@ -245,7 +245,7 @@ HALF = PinholeCamera(32, 24, 28.0, 30.0, 15.0, 11.0)
     ],
 )
 def test_a_camera_info_is_fitted_to_its_images(
-    make: Callable[..., Path], camera: PinholeCamera, more: dict, expected: PinholeCamera
+    make: Make, camera: PinholeCamera, more: dict, expected: PinholeCamera
 ) -> None:
     def write(bag: Bag) -> None:
         images(bag, info=False)
@@ -257,7 +257,7 @@ def test_a_camera_info_is_fitted_to_its_images(
     assert any("is fitted to them" in note for note in dataset.notes) == is_fitted
 
 
-def test_a_camera_info_of_another_view_is_refused(make: Callable[..., Path]) -> None:
+def test_a_camera_info_of_another_view_is_refused(make: Make) -> None:
     def write(bag: Bag) -> None:
         images(bag, info=False)
         bag.camera_info("/camera/depth/camera_info", FRAME, PinholeCamera(20, 12, 14.0, 15.0, 9.5, 5.5))
@@ -265,7 +265,7 @@ def test_a_camera_info_of_another_view_is_refused(make: Callable[..., Path]) -> 
     refused(make(write, odometry, mounted), "have 16 x 12 pixels", "20 x 12", "--camera fx,fy,cx,cy")
 
 
-def test_a_camera_info_a_moment_later_is_the_images(make: Callable[..., Path]) -> None:
+def test_a_camera_info_a_moment_later_is_the_images(make: Make) -> None:
     def write(bag: Bag) -> None:
         for i in range(COUNT):
             bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i), "16UC1")
@@ -278,7 +278,7 @@ def test_a_camera_info_a_moment_later_is_the_images(make: Callable[..., Path]) -
 
 
 @pytest.mark.parametrize("topic", ["/mavros/local_position/pose", "/robot_pose", "/amcl_pose", "/pose"])
-def test_poses_of_an_unknown_body_are_not_the_cameras(make: Callable[..., Path], topic: str) -> None:
+def test_poses_of_an_unknown_body_are_not_the_cameras(make: Make, topic: str) -> None:
     def write(bag: Bag) -> None:
         for i in range(COUNT):
             bag.pose_stamped(topic, stamp(i), "map", world_body(i) @ T_body_camera)
@@ -288,7 +288,7 @@ def test_poses_of_an_unknown_body_are_not_the_cameras(make: Callable[..., Path],
     check_poses(open_dataset(f"{path}?body={FRAME}"))
 
 
-def test_a_mounting_on_tf_below_a_topic_of_poses_is_used(make: Callable[..., Path]) -> None:
+def test_a_mounting_on_tf_below_a_topic_of_poses_is_used(make: Make) -> None:
     def write(bag: Bag) -> None:
         for i in range(COUNT):
             bag.pose_stamped("/pose", stamp(i), "map", world_body(i))
@@ -297,7 +297,7 @@ def test_a_mounting_on_tf_below_a_topic_of_poses_is_used(make: Callable[..., Pat
     check_poses(open_dataset(make(images, write)))
 
 
-def test_a_colour_camera_that_tf_places_again_and_again_is_used(make: Callable[..., Path]) -> None:
+def test_a_colour_camera_that_tf_places_again_and_again_is_used(make: Make) -> None:
     def write(bag: Bag) -> None:
         bag.camera_info("/camera/color/camera_info", "color", CAMERA)
         for i in range(COUNT):
@@ -308,7 +308,7 @@ def test_a_colour_camera_that_tf_places_again_and_again_is_used(make: Callable[.
     assert any("brought to the depth camera's pixels" in note for note in dataset.notes)
 
 
-def test_colours_and_depth_without_frames_are_not_taken_for_one_camera(make: Callable[..., Path]) -> None:
+def test_colours_and_depth_without_frames_are_not_taken_for_one_camera(make: Make) -> None:
     def write(bag: Bag) -> None:
         for name, camera in (("depth", CAMERA), ("color", WIDE)):
             bag.camera_info(f"/camera/{name}/camera_info", "", camera)
@@ -339,7 +339,7 @@ def text(bag: Bag) -> None:
     ],
 )
 def test_a_topic_that_cannot_be_read_does_not_matter_to_others(
-    make: Callable[..., Path], kind: Kind, before: bytes, after: bytes, why: str
+    make: Make, kind: Kind, before: bytes, after: bytes, why: str
 ) -> None:
     path = make(text, images, odometry, mounted, kind=kind)
     file = path if kind == "ros1" else next(path.glob("*.mcap"))

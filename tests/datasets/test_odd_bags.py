@@ -16,6 +16,7 @@ from inputs_bags import (
     FRAME,
     START,
     Bag,
+    Make,
     T_body_camera,
     check_poses,
     images,
@@ -27,6 +28,7 @@ from inputs_bags import (
     world_body,
     writing,
 )
+from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError
@@ -67,7 +69,7 @@ def localised(bag: Bag) -> None:
 
 @pytest.mark.parametrize("poses", [moving_tf, by_odometry, by_both, localised])
 def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
-    make: Callable[..., Path], poses: Callable[[Bag], None]
+    make: Make, poses: Callable[[Bag], None]
 ) -> None:
     dataset = open_dataset(make(in_map, poses, kind="mcap"))
     check_poses(dataset, T_MAP_ODOM, np.eye(4))
@@ -76,15 +78,14 @@ def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
     np.testing.assert_allclose(ranges, expected, atol=1e-4)
 
 
-def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(make: Callable[..., Path]) -> None:
+def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(make: Make) -> None:
     def content(bag: Bag) -> None:
         in_map(bag)
         moving_tf(bag)
         moving_tf(bag, T=np.eye(4), child="other")
 
     path = make(content, kind="mcap")
-    with pytest.raises(DatasetError, match=rf"are of map, in which tf's frames {BODY}, other move.*\?body="):
-        open_dataset(path)
+    refused(path, f"are of map, in which tf's frames {BODY}, other move", "?body=")
     check_poses(open_dataset(f"{path}?body={BODY}"), T_MAP_ODOM, np.eye(4))
 
 
@@ -132,7 +133,7 @@ def test_mcap_files_of_any_profile_are_read(tmp_path: Path, profile: str, encodi
     np.testing.assert_allclose(dataset.read(2).depth_m, steps(2) / np.float32(1000))
 
 
-def test_topics_of_another_encoding_in_the_metadata_are_passed_over(make: Callable[..., Path]) -> None:
+def test_topics_of_another_encoding_in_the_metadata_are_passed_over(make: Make) -> None:
     path = make(plain, lambda bag: odometry(bag, "/other"), kind="mcap")
     text = (path / "metadata.yaml").read_text()
     before, mark, after = text.rpartition("serialization_format: cdr")
@@ -142,7 +143,7 @@ def test_topics_of_another_encoding_in_the_metadata_are_passed_over(make: Callab
 
 
 def test_parts_of_a_recording_whose_first_files_are_gone_are_read_together(
-    make: Callable[..., Path], tmp_path: Path
+    make: Make, tmp_path: Path
 ) -> None:
     for number, part in ((3, range(2)), (4, range(2, COUNT))):
 
@@ -182,9 +183,7 @@ def pointer(path: Path) -> Path:
         (cut, "damaged or cut short.*mcap recover"),
     ],
 )
-def test_a_bag_that_cannot_be_opened_says_why(
-    make: Callable[..., Path], damage: Callable[[Path], Path], words: str
-) -> None:
+def test_a_bag_that_cannot_be_opened_says_why(make: Make, damage: Callable[[Path], Path], words: str) -> None:
     path = damage(make(plain, kind="mcap"))
     with pytest.raises(DatasetError, match=words) as caught:
         open_dataset(path)
@@ -232,18 +231,18 @@ def path_of(bag: Bag) -> None:
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_missing_is_named_with_the_remedy(make: Callable[..., Path], case: str) -> None:
+def test_what_is_missing_is_named_with_the_remedy(make: Make, case: str) -> None:
     content, words = REFUSED[case]
     with pytest.raises(DatasetError, match=words):
         open_dataset(make(content, kind="mcap"))
 
 
-def test_the_last_message_of_a_path_has_the_poses(make: Callable[..., Path]) -> None:
+def test_the_last_message_of_a_path_has_the_poses(make: Make) -> None:
     path = make(images, path_of, kind="mcap")
     check_poses(open_dataset(f"{path}?body={FRAME}"))
 
 
-def test_a_mounting_that_is_no_pose_is_named(make: Callable[..., Path]) -> None:
+def test_a_mounting_that_is_no_pose_is_named(make: Make) -> None:
     def content(bag: Bag) -> None:
         images(bag)
         odometry(bag)
@@ -257,11 +256,10 @@ def test_a_mounting_that_is_no_pose_is_named(make: Callable[..., Path]) -> None:
         )
         bag.send("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, transforms=[transform])
 
-    with pytest.raises(DatasetError, match=rf"transform of {FRAME} in {BODY} is none.*quaternion of 0"):
-        open_dataset(make(content, kind="mcap"))
+    refused(make(content, kind="mcap"), f"transform of {FRAME} in {BODY} is none", "quaternion of 0")
 
 
-def test_signed_millimetres_and_the_largest_value(make: Callable[..., Path]) -> None:
+def test_signed_millimetres_and_the_largest_value(make: Make) -> None:
     def image(i: int) -> np.ndarray:
         depth = steps(i).astype(np.int16)
         depth[:2], depth[2] = np.iinfo(np.int16).max, -5
@@ -273,7 +271,7 @@ def test_signed_millimetres_and_the_largest_value(make: Callable[..., Path]) -> 
     np.testing.assert_allclose(dataset.read(1).depth_m, expected)
 
 
-def test_where_stamps_stand_still_the_times_of_recording_count(make: Callable[..., Path]) -> None:
+def test_where_stamps_stand_still_the_times_of_recording_count(make: Make) -> None:
     def content(bag: Bag) -> None:
         header, bag.latency = bag.header, 0.0
         bag.header = lambda at, frame: header(7.0 if frame == FRAME else at, frame)  # type: ignore[method-assign]
@@ -284,7 +282,7 @@ def test_where_stamps_stand_still_the_times_of_recording_count(make: Callable[..
     check_poses(dataset)
 
 
-def test_stamps_of_zero_are_noted(make: Callable[..., Path]) -> None:
+def test_stamps_of_zero_are_noted(make: Make) -> None:
     """The poses lie so much later that those of the recorded times are exact."""
 
     def unstamped(bag: Bag) -> None:
@@ -306,7 +304,7 @@ def test_stamps_of_zero_are_noted(make: Callable[..., Path]) -> None:
     )
 
 
-def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Callable[..., Path]) -> None:
+def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Make) -> None:
     def once(bag: Bag) -> None:
         bag.tf("/tf", stamp(2), "map", "odom", np.eye(4))
         for i in range(COUNT):
@@ -330,9 +328,7 @@ def seen(i: int) -> np.ndarray:
 
 @pytest.mark.parametrize("source", ["tf", "odometry", "pose"])
 @pytest.mark.parametrize("is_body", [True, False])
-def test_poses_of_a_camera_link_are_turned_if_images_agree_so(
-    make: Callable[..., Path], source: str, is_body: bool
-) -> None:
+def test_poses_of_a_camera_link_are_turned_if_images_agree_so(make: Make, source: str, is_body: bool) -> None:
     frame = FRAME if source == "pose" else "camera_link"
 
     def content(bag: Bag) -> None:

@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import Content, write_image, write_stray
-from refusals import refused
+from refusals import bad_frame, refused
 
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.errors import FrameError
 
 CONTENT = Content(3)
 HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
@@ -80,6 +79,5 @@ def test_damaged_files_are_named(folder: Path, file: str, text: str, problem: st
 @pytest.mark.parametrize("levels", [np.full((192, 256), 3, np.uint8), np.ones((96, 128), np.uint8)])
 def test_confidence_that_does_not_fit_is_named(folder: Path, levels: np.ndarray) -> None:
     write_image(folder / "confidence" / "000000.png", levels)
-    with pytest.raises(FrameError, match=r"^frame 000000: .*confidence.000000\.png: has .* levels up to"):
-        open_dataset(folder).read(0)
+    bad_frame(open_dataset(folder), 0, "confidence.000000.png: has", "levels up to")
     open_dataset(folder).read(1)

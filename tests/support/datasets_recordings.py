@@ -2,7 +2,7 @@
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -70,6 +70,12 @@ def stamped_line(stamp: float, pose: Pose) -> str:
     """stamp tx ty tz qx qy qz qw."""
     numbers = (stamp, *pose[:3, 3], *quaternion_of(pose[:3, :3]))
     return " ".join(repr(float(number)) for number in numbers)
+
+
+def write_stamped(path: Path, stamps: Iterable[float], poses: Iterable[Pose]) -> Path:
+    """A file of stamped poses."""
+    path.write_text("\n".join(map(stamped_line, stamps, poses)) + "\n")
+    return path
 
 
 def write_seven_scenes(folder: Path, content: Content) -> Path:
