@@ -248,10 +248,9 @@ def test_reading_is_lazy_and_repeatable(tmp_path: Path) -> None:
     np.testing.assert_array_equal(once.depth_m, again.depth_m)
     (folder / "00181.png").unlink()
     np.testing.assert_array_equal(dataset.read(2).depth_m, once.depth_m)
-    with pytest.raises(IndexError):
-        dataset.read(3)
-    with pytest.raises(IndexError):
-        dataset.read(-1)
+    for index in (3, -1):
+        with pytest.raises(IndexError, match="3 frames"):
+            dataset.read(index)
 
 
 @pytest.mark.parametrize("images", [10**3, 10**6, 10**9])

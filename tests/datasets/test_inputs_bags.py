@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from console import FAST, mapped, report_of
 from datasets_recordings import write_stamped
 from inputs_bags import (
     BODY,
@@ -34,12 +35,13 @@ from inputs_bags import (
     world_body,
     writing,
 )
+from inputs_frames import moved
 from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.images import decode_rvl
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.geometry.poses import inverse, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
@@ -70,8 +72,6 @@ def test_every_kind_comes_back(make: Make, kind: Kind, inside: bool) -> None:
         np.testing.assert_array_equal(frame.depth_m, steps(i).astype(np.float32) / np.float32(1000))
         assert frame.stamp == pytest.approx(START + stamp(i), abs=1e-6)
     check_poses(dataset)
-    with pytest.raises(IndexError, match="5 frames"):
-        dataset.read(COUNT)
     assert any(BODY in note and FRAME in note for note in dataset.notes)
 
 
@@ -95,6 +95,66 @@ def test_encodings(make: Make, big: bool) -> None:
     for topic in ("/a/depth", "e/depth", "/b/depth"):
         exact[1, 1] = 0 if topic == "/b/depth" else exact[1, 1]
         np.testing.assert_array_equal(open_dataset(f"{path}?depth={topic}").read(0).depth_m, exact)
+
+
+T_body_link = look_at([0.2, -0.1, 0.3], [1.0, 0.2, 0.1])
+T_link_optical = look_at([0.0, 0.02, 0.0], [0.1, 1.0, 0.3])
+T_body_optical = T_body_link @ T_link_optical
+DISPLACEMENT, TURN = (0.03, 0.02, -0.01), (0.01, -0.02, 0.05)
+"""How far the body moves, in metres, and turns, in radians, in the 20 ms to either side of an image."""
+
+
+def mounting(bag: Bag) -> None:
+    bag.tf("/tf_static", 0.0, BODY, "link", T_body_link)
+    bag.tf("/tf_static", 0.0, "link", FRAME, T_link_optical)
+
+
+def as_odometry(bag: Bag) -> None:
+    """16UC1 images, and Odometry 20 ms before and after each, which the body passes on a straight line."""
+    images(bag)
+    for i in range(COUNT):
+        for sign in (-1, 1):
+            T = moved(world_body(i), DISPLACEMENT, TURN, sign)
+            bag.odometry("/odom", stamp(i) + 0.02 * sign, "map", BODY, T)
+
+
+def as_poses(bag: Bag) -> None:
+    """32FC1 images, and PoseStamped of a body that is not named."""
+    metres = [np.where(steps(i) > 0, steps(i) / np.float32(1000), np.float32(np.nan)) for i in range(COUNT)]
+    images(bag, image=metres.__getitem__, encoding="32FC1")
+    stamped_poses(bag, "/tracker/pose")
+
+
+def as_tf(bag: Bag) -> None:
+    """compressedDepth images, and a chain of two moving and two fixed transforms; colour and infrared
+    beside."""
+    informed()(bag)
+    bag.camera_info("/cam/color/camera_info", "color_optical", CAMERA)
+    for i in range(COUNT):
+        T_map_odom = look_at([0.1 * i, 0.0, 0.0], [1.0, 0.1 * i, 0.0])
+        bag.tf("/tf", stamp(i), "map", "odom", T_map_odom)
+        bag.tf("/tf", stamp(i), "odom", BODY, inverse(T_map_odom) @ world_body(i))
+        bag.image("/cam/color/image_raw", stamp(i), "color_optical", np.zeros((12, 16, 3), np.uint8), "rgb8")
+        bag.image("/cam/infra1/image_rect_raw", stamp(i), FRAME, np.ones((12, 16), np.uint16), "mono16")
+        bag.compressed_depth("/cam/depth/image_raw/compressedDepth", stamp(i), FRAME, steps(i))
+
+
+@pytest.mark.parametrize(
+    ("kind", "write", "rest"),
+    [("ros1", as_odometry, ""), ("sqlite", as_poses, "/walk.db3"), ("mcap", as_tf, "?frame=map")],
+)
+def test_each_way_of_writing_gives_the_same_frames(make: Make, kind: Kind, write: Write, rest: str) -> None:
+    dataset = open_dataset(f"{make(mounting, write, kind=kind)}{rest}")
+    check_poses(dataset, mount=T_body_optical)
+    for i, frame in enumerate(dataset):
+        np.testing.assert_array_equal(frame.depth_m, steps(i) / np.float32(1000))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_bag_is_mapped_by_the_program(make: Make, tmp_path: Path) -> None:
+    mapped(make(plain), "--out", tmp_path / "out", *FAST, "--evaluation.hold-out", "0")
+    report = report_of(tmp_path / "out")
+    assert (report["keyframes"], report["dropped_frames"]) == (COUNT, 0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

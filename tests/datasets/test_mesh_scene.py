@@ -165,8 +165,6 @@ def test_a_source_is_a_sequence_with_the_truth_beside_it(files: tuple[Path, Path
         np.testing.assert_array_equal(frame.depth_m, dataset.clean_depth(index))
         np.testing.assert_allclose(frame.depth_m, depth_in_box(CAMERA, T, ROOM), atol=1e-5)
         assert frame.stamp == index
-    with pytest.raises(IndexError):
-        dataset.read(2)
     other = PinholeCamera(8, 8, 7, 7, 3.5, 3.5)
     assert open_dataset(source, camera=other).read(0).depth_m.shape == (8, 8)
     wide = open_dataset(f"{source}&fx=50&fy=60&cx=70&cy=80").camera

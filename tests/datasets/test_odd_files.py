@@ -221,11 +221,6 @@ def test_depth_images_of_other_formats_are_read(tmp_path: Path, suffix: str) -> 
     np.testing.assert_array_equal(read_depth(path, 1000.0), 1.5)
 
 
-def test_a_jpeg_of_the_cameras_size_is_read(tmp_path: Path) -> None:
-    path = write_image(tmp_path / "a.jpg", np.full((12, 16, 3), 99, np.uint8))
-    assert read_color(path).shape == (12, 16, 3)
-
-
 def packed_zeros(codec: str, size: int) -> bytes:
     pack: dict[str, Callable[[bytes], bytes]] = {
         "bz2": bz2.compress,

@@ -13,7 +13,7 @@ from stereo_rig import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_kitt
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise, with_tuned_noise
-from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoPairs, stereo_depth
+from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoPairs, stereo_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -97,19 +97,6 @@ def test_the_callers_word_wins(folder: Path) -> None:
     assert frame.color is None
     np.testing.assert_allclose(frame.depth_m, plain.read(1).depth_m / 2, rtol=1e-6)
     refused(folder, "depth_scale", depth_scale=1000.0)
-
-
-def test_matching_can_be_changed(folder: Path) -> None:
-    dataset = open_dataset(folder)
-    assert isinstance(dataset, StereoPairs)
-    dataset.matching = StereoMatching(least_disparity=12.0)
-    assert 0 < dataset.read(0).depth_m.max() <= BASELINE * 100 / 12
-
-
-def test_a_frame_outside_the_recording(folder: Path) -> None:
-    for index in (-1, COUNT):
-        with pytest.raises(IndexError, match="3 frames"):
-            open_dataset(folder).read(index)
 
 
 @pytest.mark.parametrize("side", ["image_l", "image_r"])

@@ -1,11 +1,9 @@
 """The synthetic corridor: long enough, walkable, closed, and the same each time."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
-from console import carry_out
 
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets import open_dataset
@@ -97,18 +95,3 @@ def test_what_is_left_out_of_a_depth_picture_is_not_in_it(backend: str) -> None:
         np.testing.assert_array_equal(
             corridor.read(index).depth_m, open_dataset(SMALL, color=False).read(index).depth_m
         )
-
-
-def test_frames_are_the_same_each_time_and_differ_by_seed(backend: str) -> None:
-    once, again = opened(SMALL).read(7), opened(SMALL).read(7)
-    np.testing.assert_array_equal(once.depth_m, again.depth_m)
-    assert (opened(SMALL + "&seed=1").read(7).depth_m != once.depth_m).any()
-    assert once.color is not None
-    assert len(np.unique(once.color.reshape(-1, 3), axis=0)) > 100
-
-
-def test_info_tells_of_it(backend: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert carry_out("info", SMALL, "--json", "--arch", backend) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["frames"] == 40
-    assert facts["depth_range"] is not None
