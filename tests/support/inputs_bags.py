@@ -330,11 +330,12 @@ def moving_tf(
     T: Pose = EYE,
     child: str = BODY,
     topic: str = "/tf",
+    late: float = 0.0,
     numbers: Sequence[float] = range(COUNT),
 ) -> None:
     """The way of a body that starts at T, as transforms."""
     for i in numbers:
-        bag.tf(topic, stamp(i), parent, child, T @ world_body(i))
+        bag.tf(topic, stamp(i) + late, parent, child, T @ world_body(i))
 
 
 def stamped_poses(bag: Bag, topic: str, frame: str = "map", T_body_own: Pose = EYE) -> None:
@@ -343,9 +344,15 @@ def stamped_poses(bag: Bag, topic: str, frame: str = "map", T_body_own: Pose = E
         bag.pose_stamped(topic, stamp(i), frame, world_body(i) @ T_body_own)
 
 
-def mounted(bag: Bag, parent: str = BODY, child: str = FRAME, T: Pose = T_body_camera) -> None:
+def mounted(
+    bag: Bag,
+    parent: str = BODY,
+    child: str = FRAME,
+    T: Pose = T_body_camera,
+    topic: str = "/tf_static",
+) -> None:
     """A transform that is fixed: where the camera is on the body."""
-    bag.tf("/tf_static", 0.0, parent, child, T)
+    bag.tf(topic, 0.0, parent, child, T)
 
 
 def plain(bag: Bag) -> None:
