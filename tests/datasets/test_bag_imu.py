@@ -23,7 +23,6 @@ UP = TILT.T @ [0.0, -1.0, 0.0]
 def imu(
     bag: Bag,
     topic: str = TOPIC,
-    frame: str = BODY,
     tf: bool = True,
     covariance: float = 0.0,
     shake: float = 0.0,
@@ -31,10 +30,6 @@ def imu(
     if tf:
         bag.tf("/tf_static", 0.0, FRAME, BODY, T_camera_imu)
     to_imu, random = T_camera_imu[:3, :3].T, np.random.default_rng(0)
-
-    def vector(values: np.ndarray) -> object:
-        return bag.message("geometry_msgs/msg/Vector3", **dict(zip("xyz", values.tolist(), strict=True)))
-
     unknown = np.zeros(9)
     unknown[0] = covariance
     for k in range(160):
@@ -42,10 +37,9 @@ def imu(
         force = to_imu @ (GRAVITY * UP) + random.normal(0, shake + 1e-6, 3)
         bag.send(
             topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, BODY),
-            orientation=bag.message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            orientation_covariance=np.zeros(9), angular_velocity=vector(to_imu @ RATE),
-            angular_velocity_covariance=unknown, linear_acceleration=vector(force),
-            linear_acceleration_covariance=np.zeros(9),
+            orientation=bag.quaternion([0.0, 0.0, 0.0, 1.0]), orientation_covariance=np.zeros(9),
+            angular_velocity=bag.vector(to_imu @ RATE), angular_velocity_covariance=unknown,
+            linear_acceleration=bag.vector(force), linear_acceleration_covariance=np.zeros(9),
         )  # fmt: skip
 
 

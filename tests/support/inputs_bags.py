@@ -1,7 +1,7 @@
 """Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
 
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -167,16 +167,18 @@ class Bag:
             **arrays,
         )
 
+    def vector(self, values: Iterable[float], name: str = "Vector3") -> Any:
+        return self.message(f"geometry_msgs/msg/{name}", **dict(zip("xyz", values, strict=True)))
+
+    def quaternion(self, values: Iterable[float]) -> Any:
+        return self.message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
+
     def pose(self, T: Pose) -> Any:
-        x, y, z, w = quaternion_of(T[:3, :3])
-        return self.message(
-            "geometry_msgs/msg/Pose",
-            position=self.message("geometry_msgs/msg/Point", **dict(zip("xyz", T[:3, 3], strict=True))),
-            orientation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
+        place, turn = self.vector(T[:3, 3], "Point"), self.quaternion(quaternion_of(T[:3, :3]))
+        return self.message("geometry_msgs/msg/Pose", position=place, orientation=turn)
 
     def odometry(self, topic: str, stamp: float, frame: str, child: str, T: Pose) -> None:
-        zero = self.message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        zero = self.vector([0.0, 0.0, 0.0])
         twist = self.message("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         self.send(
             topic,
@@ -201,18 +203,14 @@ class Bag:
         self.send(topic, "nav_msgs/msg/Path", stamp, header=self.header(stamp, frame), poses=each)
 
     def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
-        x, y, z, w = quaternion_of(T[:3, :3])
+        """A transform; of a matrix of zeros, with a quaternion of zeros."""
+        turn = quaternion_of(T[:3, :3]) if T[:3, :3].any() else np.zeros(4)
+        place = {"translation": self.vector(T[:3, 3]), "rotation": self.quaternion(turn)}
         transform = self.message(
             "geometry_msgs/msg/TransformStamped",
             header=self.header(stamp, parent),
             child_frame_id=child,
-            transform=self.message(
-                "geometry_msgs/msg/Transform",
-                translation=self.message(
-                    "geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))
-                ),
-                rotation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-            ),
+            transform=self.message("geometry_msgs/msg/Transform", **place),
         )
         self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[transform])
 
