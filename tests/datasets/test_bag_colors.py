@@ -1,11 +1,11 @@
 """Colour topics of bags: registered to depth, of a camera of their own, and those that cannot be used."""
 
 from collections.abc import Callable
+from functools import partial
 
-import cv2
 import numpy as np
 import pytest
-from inputs_bags import CAMERA, COUNT, FRAME, Bag, Make, plain, stamp, steps
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, Make, images, mounted, plain, stamp, steps
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
@@ -24,28 +24,29 @@ def picture(i: int, camera: PinholeCamera = CAMERA) -> np.ndarray:
 
 
 def registered(bag: Bag, encoding: str = "rgb8") -> None:
-    for i in range(COUNT):
+    def image(i: int) -> np.ndarray:
         rgb = picture(i)
-        data = {"rgb8": rgb, "bgra8": np.dstack([rgb[..., ::-1], rgb[..., :1]])}[encoding]
-        bag.image(TOPIC, stamp(i) + 0.01, FRAME, np.ascontiguousarray(data), encoding)
+        return rgb if encoding == "rgb8" else np.dstack([rgb[..., ::-1], rgb[..., :1]])
+
+    images(bag, TOPIC, info=False, image=image, encoding=encoding, late=0.01)
 
 
 def compressed(bag: Bag) -> None:
     for i in range(COUNT):
-        data = cv2.imencode(".png", picture(i)[..., ::-1])[1]
-        bag.send(
-            TOPIC, "sensor_msgs/msg/CompressedImage", stamp(i), header=bag.header(stamp(i), FRAME),
-            format="png", data=data.reshape(-1),
-        )  # fmt: skip
+        bag.compressed(TOPIC, stamp(i), FRAME, picture(i), "png")
 
 
 def beside(bag: Bag, info: bool = True, tf: bool = True) -> None:
     if info:
         bag.camera_info("/camera/color/camera_info", OWN_FRAME, OWN)
     if tf:
-        bag.tf("/tf_static", 0.0, FRAME, OWN_FRAME, T_depth_color)
-    for i in range(COUNT):
-        bag.image(TOPIC, stamp(i), OWN_FRAME, picture(i, OWN), "rgb8")
+        mounted(bag, FRAME, OWN_FRAME, T_depth_color)
+    images(bag, TOPIC, False, OWN_FRAME, lambda i: picture(i, OWN), "rgb8")
+
+
+def left(bag: Bag) -> None:
+    """A second topic, of one image."""
+    bag.image("/left", 1.0, FRAME, picture(7), "bgr8")
 
 
 @pytest.mark.parametrize("write", [registered, lambda bag: registered(bag, "bgra8"), compressed])
@@ -68,31 +69,22 @@ def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write", "problem"),
+    ("parts", "problem"),
     [
-        (lambda bag: beside(bag, tf=False), "tf has no fixed transform"),
-        (lambda bag: beside(bag, info=False), "its CameraInfo is not known"),
-        (
-            lambda bag: (registered(bag), bag.image("/left", 1.0, FRAME, picture(0), "bgr8")),
-            "choose one with",
-        ),
+        ([partial(beside, tf=False)], "tf has no fixed transform"),
+        ([partial(beside, info=False)], "its CameraInfo is not known"),
+        ([registered, left], "choose one with"),
     ],
 )
-def test_colours_that_cannot_be_used_are_named(
-    make: Make, write: Callable[[Bag], None], problem: str
-) -> None:
-    dataset = open_dataset(make(plain, write))
+def test_colours_that_cannot_be_used_are_named(make: Make, parts: list, problem: str) -> None:
+    dataset = open_dataset(make(plain, *parts))
     assert dataset.read(0).color is None
     (note,) = [note for note in dataset.notes if note.startswith("color: ")]
     assert problem in note
 
 
 def test_a_colour_topic_can_be_chosen_and_must_be_one(make: Make) -> None:
-    def two(bag: Bag) -> None:
-        registered(bag)
-        bag.image("/left", 1.0, FRAME, picture(7), "bgr8")
-
-    path = make(plain, two)
+    path = make(plain, registered, left)
     dataset = open_dataset(f"{path}?color=/left")
     np.testing.assert_array_equal(dataset.read(0).color, picture(7)[..., ::-1])
     assert dataset.read(1).color is None

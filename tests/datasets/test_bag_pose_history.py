@@ -1,11 +1,10 @@
 """The poses of a bag as they were known at a time: paths that are sent again, and transforms that jump."""
 
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
 from inputs_bags import (
-    BODY,
     COUNT,
     FRAME,
     START,
@@ -15,10 +14,10 @@ from inputs_bags import (
     T_body_camera,
     images,
     mounted,
+    moving_tf,
     plain,
     stamp,
     world_body,
-    writing,
 )
 
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, open_pose_source
@@ -31,6 +30,11 @@ def offset(*metres: float) -> Pose:
     T = np.eye(4)
     T[:3, 3] = metres
     return T
+
+
+def way(T_fixed_odom: Pose) -> dict[float, Pose]:
+    """The camera's poses by their stamps."""
+    return {stamp(i): T_fixed_odom @ world_body(i) @ T_body_camera for i in range(COUNT)}
 
 
 def assert_poses(found: ChangedPoses | None, wanted: dict[float, Pose]) -> None:
@@ -75,49 +79,43 @@ def test_a_path_that_is_sent_again_corrects_earlier_poses(make: Make, kind: Kind
         np.testing.assert_allclose(posed.read(i).T_world_camera, T, atol=1e-9)
 
 
-def test_a_transform_that_jumps_moves_all_earlier_poses(tmp_path: Path) -> None:
-    jump = offset(0.2, -0.1, 0.0)
-    with writing(tmp_path / "walk", "sqlite") as bag:
-        images(bag)
-        mounted(bag)
+def test_a_transform_that_jumps_moves_all_earlier_poses(make: Make) -> None:
+    before, jump = offset(0.0, 0.0, 0.5), offset(0.2, -0.1, 0.0)
+
+    def corrected(bag: Bag) -> None:
         for i in range(COUNT):
-            bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
-            bag.tf("/tf", stamp(i), "map", "odom", jump if i >= 3 else offset(0.0, 0.0, 0.5))
-        bag.tf("/tf_static", 0.0, "earth", "map", offset(0.0, 0.0, 7.0))
-    source = open_pose_source(f"{tmp_path / 'walk'}?pose=tf&frame=map")
-    for now, T_map_odom in ((stamp(1), offset(0.0, 0.0, 0.5)), (stamp(4), jump)):
-        wanted = {stamp(i): T_map_odom @ world_body(i) @ T_body_camera for i in range(COUNT)}
-        assert_poses(source.poll(START + now), wanted)
+            bag.tf("/tf", stamp(i), "map", "odom", jump if i >= 3 else before)
+
+    in_earth = partial(mounted, parent="earth", child="map", T=offset(0.0, 0.0, 7.0))
+    path = make(images, mounted, moving_tf, corrected, in_earth, kind="sqlite")
+    source = open_pose_source(f"{path}?pose=tf&frame=map")
+    for now, T_map_odom in ((stamp(1), before), (stamp(4), jump)):
+        assert_poses(source.poll(START + now), way(T_map_odom))
     assert source.poll(float("inf")) is None
-    earth = open_pose_source(f"{tmp_path / 'walk'}?pose=tf").poll(float("inf"))
-    wanted = {stamp(i): offset(0.2, -0.1, 7.0) @ world_body(i) @ T_body_camera for i in range(COUNT)}
-    assert_poses(earth, wanted)
+    earth = open_pose_source(f"{path}?pose=tf").poll(float("inf"))
+    assert_poses(earth, way(offset(0.2, -0.1, 7.0)))
 
 
 def test_a_topic_of_single_poses_does_not_change(make: Make) -> None:
     source = open_pose_source(make(plain))
-    assert_poses(source.poll(float("-inf")), {stamp(i): world_body(i) @ T_body_camera for i in range(COUNT)})
+    assert_poses(source.poll(float("-inf")), way(np.eye(4)))
     assert source.poll(float("inf")) is None
 
 
-def test_what_a_bag_cannot_tell_is_refused(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        images(bag)
-        bag.tf("/tf", 1.0, "odom", BODY, world_body(0))
-        bag.tf("/tf", 1.1, "odom", BODY, world_body(1))
-        mounted(bag)
+def test_what_a_bag_cannot_tell_is_refused(make: Make) -> None:
+    def paths(bag: Bag) -> None:
         bag.path("/a", 1.0, "map", {1.0: world_body(0)})
         bag.path("/b", 1.0, "map", {})
+
+    path = make(images, mounted, partial(moving_tf, numbers=(0, 1)), paths, kind="mcap")
     for query, words in (
         ("", r"choose one with \?pose=/a or \?pose=/b or \?pose=tf"),
-        ("pose=/c", "there is no topic /c"),
-        ("pose=/b", "topic /b: no message contains a pose"),
-        ("pose=tf", f"tf corrects nothing between odom and {FRAME}"),
-        ("pose=/a&body=wheel", "tf has no frame 'wheel'"),
-        ("poses=x.txt", "does not go with --poses"),
-        ("pose=/camera/depth/image_raw", "is of type sensor_msgs/msg/Image"),
+        ("?pose=/c", "there is no topic /c"),
+        ("?pose=/b", "topic /b: no message contains a pose"),
+        ("?pose=tf", f"tf corrects nothing between odom and {FRAME}"),
+        ("?pose=/a&body=wheel", "tf has no frame 'wheel'"),
+        ("?poses=x.txt", "does not go with --poses"),
+        ("?pose=/camera/depth/image_raw", "is of type sensor_msgs/msg/Image"),
     ):
         with pytest.raises(DatasetError, match=words):
-            open_pose_source(f"{tmp_path / 'walk'}?{query}" if query else tmp_path / "walk").poll(
-                float("inf")
-            )
+            open_pose_source(f"{path}{query}").poll(float("inf"))
