@@ -38,7 +38,6 @@ def way(T_fixed_odom: Pose) -> dict[float, Pose]:
 
 
 def assert_poses(found: ChangedPoses | None, wanted: dict[float, Pose]) -> None:
-    assert found is not None
     np.testing.assert_allclose(list(found), [START + stamp for stamp in wanted])
     for T, expected in zip(found.values(), wanted.values(), strict=True):
         np.testing.assert_allclose(np.asarray(T), expected, atol=1e-9)

@@ -46,7 +46,6 @@ def ordered(points: NDArray) -> NDArray:
 
 def check(scan: Scan | None, seconds: NDArray, kept: NDArray, atol: float = 2e-3) -> Scan:
     """Points are where they were measured, up to the steps in which poses are taken."""
-    assert scan is not None
     found = points_at(scan.camera, scan.range_m)[scan.range_m > 0]
     expected = points_by_time(seconds, kept)
     assert len(found) == len(expected)
@@ -68,7 +67,6 @@ def test_rows_run_on_in_time(lost_share: float, backwards: bool) -> None:
     starts = np.broadcast_to(scan.camera.origins_m, (*scan.camera.shape, 3))  # type: ignore[arg-type]
     step_m = 10.0 * TURN_S / COLUMNS
     assert np.abs(np.diff(starts, axis=1)).max() < 2.1 * step_m, "no seam inside of a row"
-    assert scan.no_return is not None
     assert scan.no_return.sum() == lost.sum()
     assert not (scan.no_return & (scan.range_m > 0)).any()
     across = np.arccos(np.clip((scan.camera.rays()[:, 1:] * scan.camera.rays()[:, :-1]).sum(-1), -1, 1))
@@ -122,7 +120,6 @@ def test_a_sensor_that_stands_still_or_whose_poses_are_unknown_keeps_its_camera(
 def test_free_rays_have_poses_of_their_own() -> None:
     seconds = np.linspace(-0.02, 0.07, 200)
     poses = MOTION.poses(seconds)
-    assert poses is not None
     np.testing.assert_allclose(poses[:, 1, 3], 10.0 * seconds, atol=1e-3)
     table, range_m = RayTable.of_points(np.ones((200, 3)), poses)
     np.testing.assert_allclose(

@@ -161,7 +161,6 @@ def test_columns_start_where_the_sensor_was(recording: Path, monkeypatch: pytest
     expected = points(np.full((ROWS, COLUMNS), 5.0)) @ TURNED[:3, :3].T + [0, 0, 0.04]
     expected += driving()[None, :, :3, 3]
     found = frame.points_m @ T[:3, :3].T + T[:3, 3]
-    assert frame.no_return is not None
     assert not frame.no_return.any()
     for row, shift in enumerate(SHIFTS):
         own = slice(shift, shift + COLUMNS)
@@ -229,7 +228,6 @@ def test_a_scan_without_returns_says_so(recording: Path, monkeypatch: pytest.Mon
     source.frames[1].status = np.arange(COLUMNS, dtype=np.uint32) % 2
     frame = dataset.read(1)
     assert not frame.depth_m.any()
-    assert frame.no_return is not None
     assert frame.no_return.mean() == 0.5
 
 

@@ -39,7 +39,6 @@ def check_frames(path: Path) -> None:
         np.testing.assert_allclose(frame.depth_m, CONTENT.depth[i] / 1000, rtol=1e-6)
         np.testing.assert_allclose(frame.T_world_camera, CONTENT.poses[i], atol=1e-9)
         assert frame.stamp == pytest.approx(0.1 * i)
-        assert frame.color is not None
         measured = frame.depth_m > 0
         # The middle of a depth pixel is the corner that its four colour pixels share.
         np.testing.assert_allclose(frame.color[measured], np.maximum(CONTENT.color[i], 0)[measured], atol=1)
@@ -58,7 +57,6 @@ def test_packed_depth_and_confidence_come_back(tmp_path: Path, name: str) -> Non
 def test_confidence_is_a_sigma(path: Path) -> None:
     dataset = open_dataset(path)
     sigma_m = dataset.read(0).sigma_m
-    assert sigma_m is not None
     np.testing.assert_allclose(sigma_m[:, :3], np.tile([np.inf, 0.02, 0.01], (12, 1)), rtol=1e-6)
     assert with_recorded_noise(Config(), dataset).sensor == SensorConfig(sigma=(0.01,))
 

@@ -38,7 +38,6 @@ def test_depth_poses_and_camera(folder: Path) -> None:
 def test_confidence_is_a_sigma(folder: Path) -> None:
     dataset = open_dataset(folder)
     sigma_m = dataset.read(0).sigma_m
-    assert sigma_m is not None
     np.testing.assert_allclose(sigma_m[:, :3], np.tile([np.inf, 0.02, 0.01], (192, 1)), rtol=1e-6)
     applied = with_recorded_noise(Config(), dataset)
     assert applied.sensor == SensorConfig(sigma=(0.01,))

@@ -131,7 +131,6 @@ def test_the_door_opens_onto_a_room_and_closes() -> None:
 def test_frames_show_what_is_there_at_their_time(one_backend: str) -> None:
     room = opened("synthetic:room?moving=things&frames=40&width=80&height=60&noise=none")
     scene = room.moving_scene
-    assert scene is not None
     ball = scene.things[0]
     shown = []
     for index in (15, 25):
