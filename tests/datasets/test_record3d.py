@@ -14,7 +14,7 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.formats.record3d import held_bytes, unpacked
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 CONTENT = Content(3)
@@ -99,17 +99,16 @@ def test_stamps_and_sizes_that_may_be_missing(tmp_path: Path) -> None:
 
 
 def test_images_without_a_pose_are_dropped(tmp_path: Path) -> None:
-    poses = [[0.0, 0, 0, 1, 1, 2, 3]]
-    dataset = open_dataset(write_record3d(tmp_path / "walk.r3d", CONTENT, poses=poses))
+    path = write_record3d(tmp_path / "walk.r3d", CONTENT, poses=[[0.0, 0, 0, 1, 1, 2, 3]])
+    dataset = open_dataset(path)
     assert (dataset.frame_names, dataset.dropped) == (["000000"], 2)
 
 
 @pytest.mark.parametrize("poses", [None, [], [[0, 0, 0, 1, 0, 0, 0]] * 3])
 def test_a_recording_of_the_front_camera_has_to_be_tracked(tmp_path: Path, poses: object) -> None:
     path = write_record3d(tmp_path / "walk.r3d", CONTENT, poses=poses)
-    refused(
-        path, f"{path}: metadata: contains no poses, as recordings of the front camera do not; --track-poses"
-    )
+    said = f"{path}: metadata: contains no poses, as recordings of the front camera do not; --track-poses"
+    refused(path, said)
     dataset = open_dataset(path, track=True)
     assert dataset.tracked
     assert len(dataset) == 3
@@ -126,7 +125,7 @@ def test_a_recording_of_the_front_camera_has_to_be_tracked(tmp_path: Path, poses
         ({"dw": 12, "dh": 12}, "depth of 12 x 12 pixels has other proportions than colour of 32 x 24"),
         ({"K": [1, 2, 3]}, "K is no list of 9 numbers"),
         ({"K": [1, 0, 0, "one", 1, 0, 0, 0, 1]}, "K is no list of 9 numbers"),
-        ({"K": [-28, 0, 0, 0, 30, 0, 15, 11, 1]}, "K: .* both must be positive"),
+        ({"K": [-28, 0, 0, 0, 30, 0, 15, 11, 1]}, " both must be positive"),
         ({"poses": [[0, 0, 1], [1, 2]]}, "poses is no list of 7 numbers for each frame"),
         ({"poses": 5}, "poses is no list of 7"),
         ({"frameTimestamps": [1.0]}, "frameTimestamps is no list of a number"),
@@ -139,7 +138,7 @@ def test_metadata_that_cannot_be_used_are_named(
     tmp_path: Path, changes: dict[str, object], problem: str
 ) -> None:
     path = write_record3d(tmp_path / "walk.r3d", CONTENT, **changes)
-    refused(path, "walk.r3d: metadata:", f"{problem}")
+    refused(path, "walk.r3d: metadata: ", problem)
 
 
 @pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"[" * 100_000, b"\xff"])
@@ -176,9 +175,7 @@ def test_a_damaged_file_is_a_bad_frame(tmp_path: Path, file: str, data: bytes, p
     folder = write_record3d(tmp_path / "walk", CONTENT)
     (folder / f"rgbd/1.{file}").write_bytes(data)
     dataset = open_dataset(folder)
-    with pytest.raises(FrameError, match=problem) as caught:
-        dataset.read(1)
-    assert str(caught.value).startswith(f"frame 000001: {folder / 'rgbd' / f'1.{file}'}: ")
+    bad_frame(dataset, 1, f"{folder / 'rgbd' / f'1.{file}'}: ", problem)
     dataset.read(2)
 
 

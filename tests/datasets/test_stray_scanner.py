@@ -77,6 +77,6 @@ def test_damaged_files_are_named(folder: Path, file: str, text: str, problem: st
 
 @pytest.mark.parametrize("levels", [np.full((192, 256), 3, np.uint8), np.ones((96, 128), np.uint8)])
 def test_confidence_that_does_not_fit_is_named(folder: Path, levels: np.ndarray) -> None:
-    write_image(folder / "confidence" / "000000.png", levels)
-    bad_frame(open_dataset(folder), 0, "confidence.000000.png: has", "levels up to")
+    path = write_image(folder / "confidence" / "000000.png", levels)
+    bad_frame(open_dataset(folder), 0, f"{path}: has ", " levels up to")
     open_dataset(folder).read(1)
