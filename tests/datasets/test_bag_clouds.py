@@ -1,4 +1,5 @@
-"""Point clouds in bags: fields by name, rings, times, poses; and what is wrong with them."""
+"""Point clouds in bags: fields by name, rings, times, poses, images of beams and columns; and what is wrong
+with them."""
 
 from pathlib import Path
 
@@ -11,10 +12,11 @@ from refusals import bad_frame, refused
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.ros.lidar import LidarBag, decode
+from taichi_mrf.datasets.ros.lidar import LidarBag, by_ring, decode, organised
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.spherical import SphericalCamera
 
 
 @pytest.mark.parametrize(("kind", "big"), [("ros1", False), ("sqlite", True), ("mcap", False)])
@@ -217,3 +219,88 @@ def test_times_that_are_far_from_the_stamp_are_not_believed(times: NDArray) -> N
     rows["time"] = times
     cloud = decode(Message(fields=fields, point_step=20, row_step=40, data=rows.view(np.uint8)), 100.0)
     assert cloud.seconds is None
+
+
+ELEVATIONS = np.linspace(0.4, -0.3, 6)
+AZIMUTHS = 1.0 - 2 * np.pi * np.arange(32) / 32
+NOTHING_BACK = np.random.default_rng(3).random((6, 32)) < 0.3
+
+
+def lidar(offsets: NDArray | None = None) -> SphericalCamera:
+    return SphericalCamera(ELEVATIONS, AZIMUTHS, offsets)
+
+
+def scan(camera: SphericalCamera, nothing: float = np.nan) -> NDArray:
+    """Points (H, W, 3) at random ranges, some without a return."""
+    ranges = np.random.default_rng(1).uniform(2.0, 9.0, camera.shape)
+    points = camera.rays() * ranges[..., None]
+    points[NOTHING_BACK] = nothing
+    return points
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+@pytest.mark.parametrize("offsets", [None, np.array([0.05, -0.04, 0.0, 0.02, 0.06, -0.03])])
+def test_all_rays_come_back(nothing: float, offsets: NDArray | None) -> None:
+    camera = lidar(offsets)
+    found = organised(scan(camera, nothing))
+    assert found is not None
+    image, numbers = found
+    table, range_m = image.camera, image.range_m
+    np.testing.assert_array_equal(image.no_return, NOTHING_BACK)
+    np.testing.assert_array_equal(numbers, np.arange(NOTHING_BACK.size).reshape(NOTHING_BACK.shape))
+    np.testing.assert_array_equal(range_m > 0, ~NOTHING_BACK)
+    np.testing.assert_allclose(table.rays(), camera.rays(), atol=1e-6)
+    np.testing.assert_allclose(
+        (table.rays() * range_m[..., None])[~NOTHING_BACK], scan(camera)[~NOTHING_BACK], atol=1e-5
+    )
+
+
+def test_rows_that_are_whole_columns_ahead_are_shifted_back() -> None:
+    camera = lidar()
+    shifts = [0, 3, 0, -2, 9, 1]
+    staggered = np.stack(
+        [np.roll(row, shift, axis=0) for shift, row in zip(shifts, scan(camera), strict=True)]
+    )
+    found, plain = organised(staggered), organised(scan(camera))
+    assert plain is not None
+    rays = found[0].camera.rays()
+    across = np.diff(np.unwrap(np.arctan2(rays[..., 1], rays[..., 0]), axis=0), axis=0)
+    assert np.abs(across).max() < 1e-5, "a column has one azimuth"
+    np.testing.assert_array_equal(found[0].no_return.sum(axis=1), NOTHING_BACK.sum(axis=1))
+    ranges = (np.sort(each.range_m, axis=None) for each, _ in (found, plain))
+    np.testing.assert_allclose(*ranges)
+    points, measured = staggered.reshape(-1, 3)[found[1]], found[0].range_m > 0
+    np.testing.assert_allclose(
+        np.linalg.norm(points, axis=-1)[measured], found[0].range_m[measured], rtol=1e-6
+    )
+
+
+def test_a_row_without_a_return_lies_between_its_neighbours() -> None:
+    points = scan(lidar())
+    points[2] = np.nan
+    found = organised(points)
+    np.testing.assert_allclose(found[0].camera.rays()[2], lidar().rays()[2], atol=1e-6)
+
+
+def test_points_in_no_order_are_no_image() -> None:
+    points = scan(lidar()).reshape(-1, 3)
+    assert organised(np.random.default_rng(2).permutation(points).reshape(6, 32, 3)) is None
+    assert organised(points[None]) is None
+    assert organised(np.full((6, 32, 3), np.nan)) is None
+
+
+def test_a_part_of_a_turn_whose_rows_are_ahead_is_no_image() -> None:
+    part = scan(lidar())[:, :12]
+    assert organised(part) is not None
+    assert organised(np.stack([np.roll(row, 2 * i, axis=0) for i, row in enumerate(part)])) is None
+
+
+def test_rings_make_an_image_if_they_are_equally_long() -> None:
+    points = scan(lidar())
+    ring = np.repeat(np.array([5, 4, 3, 2, 1, 0]), 32)
+    order = np.argsort(np.tile(np.arange(32), 6), kind="stable")  # column by column, as drivers write
+    numbers = by_ring(points.reshape(-1, 3)[order], ring[order])
+    assert numbers is not None
+    np.testing.assert_array_equal(points.reshape(-1, 3)[order][numbers], points)
+    assert by_ring(points.reshape(-1, 3)[1:], ring[1:]) is None
+    assert by_ring(points.reshape(-1, 3), np.zeros(192, int)) is None

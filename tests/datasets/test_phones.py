@@ -1,4 +1,5 @@
-"""Record3D's recordings: depth, poses, cameras, colours, and confidence as a sigma for each pixel."""
+"""Recordings of phones, by Record3D and Stray Scanner: depth, poses, cameras, colours, and confidence as a
+sigma for each pixel."""
 
 import struct
 import zipfile
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import CAMERA, Content, write_record3d
+from datasets_recordings import CAMERA, Content, write_image, write_record3d, write_stray
 from refusals import bad_frame, refused
 
 from taichi_mrf.config.schema import Config, SensorConfig
@@ -218,3 +219,73 @@ def test_packed_blocks_tell_what_they_hold() -> None:
         assert unpacked(packed, len(content)) == content
         with pytest.raises(DatasetError, match=r"cut short|damaged"):
             unpacked(packed[:-4], len(content))
+
+
+HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
+
+
+@pytest.fixture
+def stray(tmp_path: Path) -> Path:
+    return write_stray(tmp_path / "walk", CONTENT)
+
+
+def test_depth_poses_and_camera(stray: Path) -> None:
+    dataset = open_dataset(stray)
+    assert (len(dataset), dataset.dropped) == (3, 0)
+    camera = dataset.camera
+    assert camera.shape == (192, 256)
+    # A pixel of depth is a square of 7.5 pixels of colour: their middles and the rays to the corners agree.
+    np.testing.assert_allclose(camera.directions(127.5, 95.5), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(camera.directions(255.5, 191.5), [960 / 1500, 720 / 1500, 1.0])
+    for i, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.depth_m, np.resize(CONTENT.depth[i], (192, 256)) / 1000, rtol=1e-6)
+        np.testing.assert_allclose(frame.T_world_camera, CONTENT.poses[i], atol=1e-9)
+        assert frame.stamp == pytest.approx(100 + 0.1 * i)
+        assert frame.color is None
+
+
+def test_confidence_of_stray_scanner_is_a_sigma(stray: Path) -> None:
+    dataset = open_dataset(stray)
+    sigma_m = dataset.read(0).sigma_m
+    np.testing.assert_allclose(sigma_m[:, :3], np.tile([np.inf, 0.02, 0.01], (192, 1)), rtol=1e-6)
+    applied = with_recorded_noise(Config(), dataset)
+    assert applied.sensor == SensorConfig(sigma=(0.01,))
+    assert any("assumed for a phone's lidar" in note for note in dataset.notes)
+
+
+def test_without_confidence_the_sigma_is_that_of_the_format(stray: Path) -> None:
+    (stray / "confidence" / "000001.png").unlink()
+    dataset = open_dataset(stray)
+    assert dataset.stated.pixel_sigma
+    assert dataset.read(1).sigma_m is None
+    assert dataset.read(2).sigma_m is not None
+
+
+def test_images_of_stray_scanner_without_a_pose_are_dropped(stray: Path) -> None:
+    lines = (stray / "odometry.csv").read_text().splitlines()
+    (stray / "odometry.csv").write_text("\n".join([*lines[:2], "", lines[3]]))
+    dataset = open_dataset(stray)
+    assert (dataset.frame_names, dataset.dropped) == (["000000", "000002"], 1)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "problem"),
+    [
+        ("odometry.csv", "", "names no column timestamp"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz\n", "names no column qw"),
+        ("odometry.csv", HEADER + "1, 0, 0, 0\n", "line 2: expected 9 numbers"),
+        ("odometry.csv", HEADER + "1,99,0,0,0,0,0,0,1\n", "a pose for none"),
+        ("camera_matrix.csv", "1, 2, 3\n4, 5\n", "expected a 3 x 3 matrix"),
+        ("camera_matrix.csv", "-9, 0, 3\n0, -9, 3\n0, 0, 1\n", "must be positive"),
+    ],
+)
+def test_damaged_files_are_named(stray: Path, file: str, text: str, problem: str) -> None:
+    (stray / file).write_text(text)
+    refused(stray, str(stray / file), problem)
+
+
+@pytest.mark.parametrize("levels", [np.full((192, 256), 3, np.uint8), np.ones((96, 128), np.uint8)])
+def test_confidence_that_does_not_fit_is_named(stray: Path, levels: np.ndarray) -> None:
+    path = write_image(stray / "confidence" / "000000.png", levels)
+    bad_frame(open_dataset(stray), 0, f"{path}: has ", " levels up to")
+    open_dataset(stray).read(1)
