@@ -17,8 +17,6 @@ from taichi_mrf.datasets.synthetic.corridor import (
     OVERLAP_M,
     Room,
     SmoothWay,
-    SyntheticCorridor,
-    SyntheticRing,
     corridor_length,
     corridor_scene,
     waypoints,
@@ -30,14 +28,8 @@ from taichi_mrf.mapping.selection import is_held_out
 SMALL = "synthetic:corridor?rooms=3&frames=40&width=80&height=60"
 
 
-def opened(source: str) -> SyntheticCorridor:
-    dataset = open_dataset(source)
-    assert isinstance(dataset, SyntheticCorridor)
-    return dataset
-
-
 def test_by_default_it_gives_a_map_more_than_500_keyframes() -> None:
-    corridor = opened("synthetic:corridor")
+    corridor = open_dataset("synthetic:corridor")
     every = EvaluationConfig().hold_out
     kept = [number for number in range(1, len(corridor) + 1) if not is_held_out(number, every)]
     assert len(kept) >= 500
@@ -47,7 +39,7 @@ def test_by_default_it_gives_a_map_more_than_500_keyframes() -> None:
 
 @pytest.mark.parametrize("rooms", [1, 4, 12])
 def test_the_camera_keeps_clear_and_visits_every_room(rooms: int) -> None:
-    corridor = opened(f"synthetic:corridor?rooms={rooms}&frames={60 * rooms}")
+    corridor = open_dataset(f"synthetic:corridor?rooms={rooms}&frames={60 * rooms}")
     poses = [corridor.pose(i) for i in range(len(corridor))]
     eyes = np.array([T[:3, 3] for T in poses])
     assert corridor.signed_distance(eyes).min() > 0.35  # a doorway is 0.92 m wide
@@ -83,7 +75,7 @@ def test_rooms_differ_and_the_way_ends_at_the_other_end() -> None:
 
 @pytest.mark.parametrize("rooms", [1, 2, 3])
 def test_it_is_closed(backend: str, rooms: int) -> None:
-    corridor = opened(f"synthetic:corridor?rooms={rooms}&frames=24&width=80&height=60&noise=none")
+    corridor = open_dataset(f"synthetic:corridor?rooms={rooms}&frames=24&width=80&height=60&noise=none")
     reach = np.array([corridor_length(rooms) / 2, HALF_WIDTH + WALL + WIDTH, HEIGHT / 2])
     middle = np.array([corridor_length(rooms) / 2, 0, HEIGHT / 2]) + CORRIDOR_IN_WORLD
     for index in range(len(corridor)):
@@ -96,7 +88,7 @@ def test_it_is_closed(backend: str, rooms: int) -> None:
 
 def test_what_is_left_out_of_a_depth_picture_is_not_in_it(backend: str) -> None:
     """Solids beside the picture are not rendered; with a colour picture all of them are."""
-    corridor = opened(SMALL)
+    corridor = open_dataset(SMALL)
     for index in range(0, 40, 5):
         np.testing.assert_array_equal(
             corridor.read(index).depth_m, open_dataset(SMALL, color=False).read(index).depth_m
@@ -106,15 +98,9 @@ def test_what_is_left_out_of_a_depth_picture_is_not_in_it(backend: str) -> None:
 RING = "synthetic:ring?frames=60&width=80&height=60&noise=none"
 
 
-def opened_ring(source: str) -> SyntheticRing:
-    ring = open_dataset(source)
-    assert isinstance(ring, SyntheticRing)
-    return ring
-
-
 @pytest.mark.parametrize("length", [24, 60])
 def test_the_camera_keeps_clear_and_comes_back(length: int) -> None:
-    ring = opened_ring(f"{RING}&length={length}")
+    ring = open_dataset(f"{RING}&length={length}")
     poses = [ring.way.pose_at(metres) for metres in np.arange(0.0, ring.way.length_m, 0.1)]
     assert ring.signed_distance([T[:3, 3] for T in poses]).min() > 0.3
     assert 0.9 * (length + OVERLAP_M) < ring.way.length_m < length + OVERLAP_M
@@ -146,7 +132,7 @@ def test_a_way_goes_where_its_corners_are_and_rounds_them() -> None:
 
 
 def test_it_is_closed_and_bare_walls_are_seen_through_nothing(backend: str) -> None:
-    furnished, bare = opened_ring(RING), opened_ring(f"{RING}&walls=bare")
+    furnished, bare = open_dataset(RING), open_dataset(f"{RING}&walls=bare")
     assert len(bare.scene.solids) == 7 < len(furnished.scene.solids)
     for index in range(0, 60, 12):
         T, seen = bare.pose(index), bare.clean_depth(index)

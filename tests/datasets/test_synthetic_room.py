@@ -53,12 +53,6 @@ solids = st.builds(
 )
 
 
-def opened(source: str) -> SyntheticRoom:
-    dataset = open_dataset(source)
-    assert isinstance(dataset, SyntheticRoom)
-    return dataset
-
-
 def world_rays(camera: PinholeCamera, T: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions in the world, (H * W, 3), one metre of axial depth long."""
     return camera.rays().reshape(-1, 3) @ T[:3, :3].T
@@ -169,7 +163,7 @@ def test_any_camera_sees_the_same_scene(backend: str) -> None:
 
 @pytest.mark.parametrize("index", range(0, 60, 7))
 def test_clean_depth_lies_on_the_surface_and_before_all_others(backend: str, index: int) -> None:
-    room = opened(SMALL)
+    room = open_dataset(SMALL)
     T, depth = room.pose(index), room.clean_depth(index).astype(np.float64).ravel()
     rays = world_rays(room.camera, T)
     assert (depth > 0).all()  # the room is closed
@@ -208,7 +202,7 @@ def test_the_camera_keeps_clear_moves_smoothly_and_closes_its_loop() -> None:
 
 
 def test_all_walls_and_most_of_the_room_are_seen(backend: str) -> None:
-    room = opened("synthetic:room?width=80&height=60&frames=30&noise=none")
+    room = open_dataset("synthetic:room?width=80&height=60&frames=30&noise=none")
     points = []
     for i in range(len(room)):
         T, depth = room.pose(i), room.clean_depth(i).astype(np.float64).reshape(-1, 1)
@@ -219,17 +213,17 @@ def test_all_walls_and_most_of_the_room_are_seen(backend: str) -> None:
 
 
 def test_frames_are_deterministic_whatever_the_order(backend: str) -> None:
-    once = {i: opened(SMALL).read(i) for i in (2, 5)}
-    room = opened(SMALL)
+    once = {i: open_dataset(SMALL).read(i) for i in (2, 5)}
+    room = open_dataset(SMALL)
     for i in (5, 2):
         again = room.read(i)
         np.testing.assert_array_equal(again.depth_m, once[i].depth_m)
         np.testing.assert_array_equal(again.color, once[i].color)
-    assert (opened(SMALL + "&seed=1").read(2).depth_m != once[2].depth_m).any()
+    assert (open_dataset(SMALL + "&seed=1").read(2).depth_m != once[2].depth_m).any()
 
 
 def test_noise_is_that_of_a_kinect(backend: str) -> None:
-    room = opened("synthetic:room?width=640&height=480&frames=60")
+    room = open_dataset("synthetic:room?width=640&height=480&frames=60")
     clean, noisy = room.clean_depth(50).astype(np.float64), room.read(50).depth_m.astype(np.float64)
     seen = noisy > 0
     assert 0.8 < seen.mean() < 0.999
@@ -242,7 +236,7 @@ def test_noise_is_that_of_a_kinect(backend: str) -> None:
 
 
 def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
-    room = opened(SMALL + "&noise=none")
+    room = open_dataset(SMALL + "&noise=none")
     frame = room.read(3)
     np.testing.assert_array_equal(frame.depth_m, room.clean_depth(3))
     np.testing.assert_array_equal(frame.T_world_camera, room.pose(3))
@@ -254,10 +248,10 @@ def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
 
 
 def test_options_and_defaults() -> None:
-    room = opened("synthetic:room")
+    room = open_dataset("synthetic:room")
     assert len(room) == len(room.frame_names) == 32
     assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
-    assert len(opened("synthetic:room?frames=7&seed=3&noise=none")) == 7
+    assert len(open_dataset("synthetic:room?frames=7&seed=3&noise=none")) == 7
     assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
     with pytest.raises(IndexError):
         room.read(32)
@@ -298,7 +292,7 @@ def test_a_depth_scale_has_no_meaning_here(name: str) -> None:
 def test_rendering_before_taichi_runs_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "active", lambda: None)
     with pytest.raises(BackendError, match=r"call taichi_mrf\.init\(\) first"):
-        opened(SMALL).read(0)
+        open_dataset(SMALL).read(0)
 
 
 MOTTLED_SIZE = "synthetic:room?width=80&height=60&frames=60"
@@ -358,12 +352,6 @@ def inside(solids: tuple[Solid, ...]) -> NDArray[np.float64]:
         c, s = math.cos(solid.yaw), math.sin(solid.yaw)
         points.append(solid.center + local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
     return np.concatenate(points)
-
-
-def opened_moving(source: str) -> SyntheticRoom:
-    dataset = open_dataset(source, color=False)
-    assert isinstance(dataset, SyntheticRoom)
-    return dataset
 
 
 @given(
@@ -451,7 +439,7 @@ def test_the_door_opens_onto_a_room_and_closes() -> None:
 
 
 def test_frames_show_what_is_there_at_their_time(one_backend: str) -> None:
-    room = opened_moving("synthetic:room?moving=things&frames=40&width=80&height=60&noise=none")
+    room = open_dataset("synthetic:room?moving=things&frames=40&width=80&height=60&noise=none", color=False)
     scene = room.moving_scene
     ball = scene.things[0]
     shown = []
@@ -469,7 +457,7 @@ def test_frames_show_what_is_there_at_their_time(one_backend: str) -> None:
 
 
 def test_a_room_without_motion_is_the_furnished_room() -> None:
-    room = opened_moving("synthetic:room")
+    room = open_dataset("synthetic:room", color=False)
     assert room.moving_scene is None
     assert room.scene_at(3) is room.scene
     assert room.stamp_at(5) == 1.0
