@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_recordings import body, opengl, w_first
-from datasets_recordings import CAMERA, FORMATS, Content, row_of, stamped_line, write_image
+from datasets_recordings import (
+    CAMERA,
+    FORMATS,
+    Content,
+    stamped_line,
+    write_image,
+    write_log,
+    write_rows,
+    write_stamped,
+)
 from every_format import EVERY
 from refusals import refused
 
@@ -169,13 +178,10 @@ def write_room(
         steps = np.rint(room_depth_m(pose) * steps_per_metre).astype(np.uint16)
         write_image(folder / f"{number:04d}.png", steps)
     (folder / "K.txt").write_text("70 0 39.5\n0 70 29.5\n0 0 1\n")
-    lines = [row_of(pose) for pose in poses]
     if layout == "log":
-        lines = [
-            f"{i} {i} {i + 1}\n" + "\n".join(" ".join(map(str, row)) for row in p)
-            for i, p in enumerate(poses)
-        ]
-    (folder / f"poses.{'log' if layout == 'log' else 'txt'}").write_text("\n".join(lines))
+        write_log(folder / "poses.log", poses)
+    else:
+        write_rows(folder / "poses.txt", poses)
     return folder
 
 
@@ -196,13 +202,11 @@ def test_an_assumed_scale_is_replaced_by_the_one_that_fits(tmp_path: Path, steps
 def test_a_scale_of_the_format_gives_way_to_the_poses(tmp_path: Path) -> None:
     """As of recorders that write the layout of TUM RGB-D with millimetres."""
     written, folder = open_dataset(write_room(tmp_path / "mine", 1000.0)), tmp_path / "tum"
-    (folder / "depth").mkdir(parents=True)
-    lines = []
-    for i in range(len(written)):
-        image = np.rint(1000 * written.read(i).depth_m).astype(np.uint16)
-        write_image(folder / f"depth/{i / 10:.6f}.png", image)
-        lines.append(stamped_line(i / 10, written.pose(i)))
-    (folder / "groundtruth.txt").write_text("\n".join(lines))
+    stamps = [i / 10 for i in range(len(written))]
+    for stamp, frame in zip(stamps, written, strict=True):
+        image = np.rint(1000 * frame.depth_m).astype(np.uint16)
+        write_image(folder / f"depth/{stamp:.6f}.png", image)
+    write_stamped(folder / "groundtruth.txt", stamps, [frame.T_world_camera for frame in written])
     dataset = open_dataset(folder, camera=written.camera)
     assert any("found by comparing neighbouring frames" in note for note in dataset.notes)
     np.testing.assert_allclose(dataset.read(3).depth_m, written.read(3).depth_m, atol=1e-3)

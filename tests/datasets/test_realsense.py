@@ -87,13 +87,11 @@ def test_an_image_of_another_size_is_a_broken_frame(library: type[Pipeline]) -> 
         open_dataset(CAMERA).read(0)
 
 
-def test_what_the_library_says_is_passed_on(library: type[Pipeline]) -> None:
+def test_a_camera_that_cannot_be_opened_says_why(library: type[Pipeline], tmp_path: Path) -> None:
+    refused("realsense:heigth=3", "heigth")
+    refused(f"realsense:?poses={tmp_path}/nowhere.txt", "nowhere.txt")
     library.problem = "No device connected"
     refused("realsense:", "realsense: cannot be started: No device connected")
-
-
-def test_a_wrong_option_is_named(library: type[Pipeline]) -> None:
-    refused("realsense:heigth=3", "heigth")
 
 
 def test_the_camera_is_given_back_with_its_source(library: type[Pipeline]) -> None:
@@ -206,16 +204,13 @@ def test_an_image_that_does_not_come_again_is_a_broken_frame(
     np.testing.assert_allclose(source.read(3).depth_m, (STEPS + 30) * 0.0005, rtol=1e-6)
 
 
-def test_what_is_no_recording_is_named(library: type[Pipeline], tmp_path: Path) -> None:
+def test_what_is_no_recording_is_named(library: type[Pipeline], recording: Path, tmp_path: Path) -> None:
     refused(f"realsense:{tmp_path}/nowhere.bag", "nowhere.bag: no such file")
     path = tmp_path / "other.bag"
     path.write_bytes(b"no bag")
     refused(f"realsense:{path}", "other.bag: cannot be played: Failed to resolve")
     refused(f"realsense:{path}?pose=x", "unknown parameter 'pose'")
     refused(f"realsense:{path}", "depth_scale", depth_scale=1000.0)
-
-
-def test_an_empty_recording_is_named(library: type[Pipeline], recording: Path) -> None:
     library.lost = tuple(range(COUNT))
     refused(f"realsense:{recording}", "walk.bag: contains no depth images")
 
@@ -272,10 +267,6 @@ def test_the_gyroscope_of_a_recording_is_read_whole(library: type[Pipeline], rec
     plain = open_dataset(f"realsense:{recording}")
     assert plain.read(0).gyro is None
     assert not any("imu" in note for note in plain.notes)
-
-
-def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:
-    refused(f"realsense:?poses={tmp_path}/nowhere.txt", "nowhere.txt")
 
 
 @pytest.mark.usefixtures("one_backend")

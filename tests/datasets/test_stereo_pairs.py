@@ -124,16 +124,10 @@ def test_a_missing_image_is_named_and_the_others_are_read(folder: Path, side: st
     assert (dataset.read(2).depth_m > 0).any()
 
 
-def test_images_of_another_size_are_named(folder: Path) -> None:
-    write_image(folder / "image_r/000001.png", np.zeros((60, 150), np.uint8))
-    dataset = open_dataset(folder)
-    bad_frame(dataset, 1, "image_r", "150 x 60 pixels, the camera 160 x 60")
-
-
-def test_a_pose_that_is_none_is_named(folder: Path) -> None:
-    lines = (folder / "poses.txt").read_text().splitlines()
-    lines[1] = row_of(2 * np.eye(4)[:3])
-    (folder / "poses.txt").write_text("\n".join(lines))
+def test_a_pose_that_is_none_and_an_image_of_another_size_are_named(folder: Path) -> None:
+    write_image(folder / "image_r/000002.png", np.zeros((60, 150), np.uint8))
+    bad_frame(open_dataset(folder), 2, "image_r", " 150 x 60 pixels, the camera 160 x 60")
+    write_rows(folder / "poses.txt", [np.eye(4), 2 * np.eye(4), np.eye(4)])
     bad_frame(open_dataset(folder), 1, "poses.txt line 2")
 
 
@@ -167,28 +161,26 @@ def test_a_bad_calibration_is_refused(folder: Path, text: str, said: str) -> Non
     refused(folder, "calib.txt: ", *said.split(" .* "))
 
 
+def test_other_broken_files_are_named(folder: Path) -> None:
+    for text, said in (("0\n0.1\nsoon", ""), ("0\n0.1\ninf", ": the stamp is not finite")):
+        (folder / "times.txt").write_text(text)
+        refused(folder, f"times.txt line 3{said}")
+    (folder / "times.txt").unlink()
+    (folder / "poses.txt").write_text("\n".join(["0 0 0 0 0 0 0 1"] * COUNT))
+    refused(folder, "poses.txt: expected a 3 x 4 matrix")
+    images = [path for side in ("image_l", "image_r") for path in (folder / side).iterdir()]
+    for path in images:
+        path.write_bytes(b"")
+    refused(folder, "image_l: none of its images can be read")
+    for path in images:
+        path.unlink()
+    refused(folder, "no numbered images in image_l or image_r")
+
+
 @pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
     refused(folder, f"{name}: is missing")
-
-
-def test_other_broken_files_are_named(folder: Path) -> None:
-    (folder / "times.txt").write_text("0\n0.1\nsoon")
-    refused(folder, "times.txt line 3")
-    (folder / "times.txt").write_text("0\n0.1\ninf")
-    refused(folder, "times.txt line 3: the stamp is not finite")
-    (folder / "times.txt").unlink()
-    (folder / "poses.txt").write_text("\n".join(["0 0 0 0 0 0 0 1"] * COUNT))
-    refused(folder, "poses.txt: expected a 3 x 4 matrix")
-    for side in ("image_l", "image_r"):
-        for path in (folder / side).iterdir():
-            path.write_bytes(b"")
-    refused(folder, "image_l: none of its images can be read")
-    for side in ("image_l", "image_r"):
-        for path in (folder / side).iterdir():
-            path.unlink()
-    refused(folder, "no numbered images in image_l or image_r")
 
 
 @pytest.fixture(scope="module")
@@ -316,14 +308,14 @@ def test_stamps_in_a_file(tmp_path: Path) -> None:
         ({"focal": 1.0}, "unknown parameter 'focal'"),
         ({"left": "cam7/*.png"}, "left: no file matches cam7/*.png"),
         ({"right": "cam1/b.png"}, "3 left images but 1 right ones"),
-        ({"right": "/cam1/*.png"}, " is not a relative pattern"),
+        ({"right": "/cam1/*.png"}, "right: .* is not a relative pattern"),
         ({"poses": "nowhere.txt"}, "nowhere.txt: there is no such file"),
         ({"matching": {"paths": 7}}, "paths must be one of 3, 4, 5, 8"),
         ({"matching": {"block_size": 4}}, "stereo block_size must be odd"),
     ],
 )
 def test_a_description_that_makes_no_sense(tmp_path: Path, changes: dict, said: str) -> None:
-    refused(write(tmp_path, NAMES, **changes), said)
+    refused(write(tmp_path, NAMES, **changes), *said.split(" .* "))
 
 
 @pytest.mark.parametrize("text", ["", "17", "[1, 2", "fx: [1"])
