@@ -276,7 +276,7 @@ def test_a_camera_with_its_size(tmp_path: Path) -> None:
     (folder / "camera.txt").unlink()
     with pytest.raises(TaichiMRFError, match=r"scaled to this size it is --camera 13\.125,13\.125,"):
         open_dataset(folder)
-    write_replica(tmp_path / "replica", TWO, tmp_path / "cam_params.json")
+    write_replica(tmp_path / "replica", TWO)
     (tmp_path / "cam_params.json").write_text(
         (tmp_path / "cam_params.json").read_text().replace('"w": 16, "h": 12', '"w": 32, "h": 24')
     )

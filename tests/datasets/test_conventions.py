@@ -9,13 +9,13 @@ import pytest
 from broken_recordings import body, opengl, w_first
 from datasets_recordings import (
     CAMERA,
-    FORMATS,
     Content,
     stamped_line,
     write_image,
     write_log,
     write_rows,
     write_stamped,
+    write_tum,
 )
 from every_format import EVERY
 from refusals import refused
@@ -88,7 +88,7 @@ def test_an_origin_far_away_is_moved(name: str, tmp_path: Path) -> None:
 
 def test_poses_of_a_file_have_conventions_and_an_origin_too(tmp_path: Path) -> None:
     content = Content()
-    folder = FORMATS["tum"][0](tmp_path / "recording", content)
+    folder = write_tum(tmp_path / "recording", content)
     stamps = open_dataset(folder, camera=CAMERA).stamps()
     lines = [
         stamped_line(s + 0.25, inverse(moved(T, ORIGIN))) for s, T in zip(stamps, content.poses, strict=True)
@@ -104,7 +104,7 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
     """The camera moves 1 m/s along x: half a second late is half a metre."""
     content = Content()
     content.poses = [moved(np.eye(4), [i / 30, 0.0, 0.0]) for i in range(5)]
-    folder = FORMATS["tum"][0](tmp_path / "recording", content)
+    folder = write_tum(tmp_path / "recording", content)
     plain = open_dataset(folder, camera=CAMERA)
     step = plain.stamps()[1] - plain.stamps()[0]
     dataset = open_dataset(folder, camera=CAMERA, poses_are=f"late={0.5 * step}")
@@ -118,7 +118,7 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
 
 
 def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:
-    folder = FORMATS["tum"][0](tmp_path / "recording", Content())
+    folder = write_tum(tmp_path / "recording", Content())
     plain = open_dataset(folder, camera=CAMERA).read(2)
     axial = open_dataset(folder, camera=CAMERA, depth_is="range").read(2)
     u, v = np.meshgrid(np.arange(16), np.arange(12))

@@ -36,12 +36,13 @@ def content() -> Content:
     return Content()
 
 
-def test_scannet(tmp_path: Path, content: Content) -> None:
-    folder = write_scannet(tmp_path / "scene0000_00", content)
-    dataset = open_dataset(folder)
-    check_frames(dataset, content, 1000.0)
+def test_scannet_and_replica_need_no_note(tmp_path: Path, content: Content) -> None:
+    dataset = open_dataset(write_scannet(tmp_path / "scene0000_00", content))
     assert list(dataset.frame_names) == ["0", "5", "10", "15", "20"]
     assert dataset.notes == []
+    assert open_dataset(write_replica(tmp_path / "room0", content)).notes == []
+    beside = write_replica(tmp_path / "room1" / "own", content, ".")
+    check_frames(open_dataset(beside), content, 6553.5, colored=True)
 
 
 def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Content) -> None:
@@ -107,18 +108,9 @@ def test_scannets_colours_without_their_camera(tmp_path: Path, content: Content)
     assert [note for note in dataset.notes if "intrinsic_color.txt" in note]
 
 
-@pytest.mark.parametrize("place", [".", ".."], ids=["beside", "above"])
-def test_replica(tmp_path: Path, content: Content, place: str) -> None:
-    folder = tmp_path / "room0"
-    folder.mkdir()
-    dataset = open_dataset(write_replica(folder, content, folder / place / "cam_params.json"))
-    check_frames(dataset, content, 6553.5, colored=True)
-    assert dataset.notes == []
-
-
 def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     content = Content(2, (680, 1200))
-    folder = write_replica(tmp_path, content, tmp_path / "cam_params.json")
+    folder = write_replica(tmp_path, content, ".")
     (folder / "cam_params.json").write_text('{"camera": {"w": 16}}')
     refused(folder, "cam_params.json: camera needs the numbers w, h")
     (folder / "cam_params.json").write_text("{")
@@ -129,14 +121,6 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     refused(folder, "one for each depth image, found 1 poses")
     (folder / "traj.txt").unlink()
     refused(folder, "traj.txt: is missing")
-
-
-def test_open3d_with_a_log(tmp_path: Path, content: Content) -> None:
-    folder = write_numbered(tmp_path, content, place="depth")
-    (folder / "camera.txt").unlink()
-    (folder / "camera_intrinsic.json").write_text(json.dumps(INTRINSIC))
-    write_log(folder / "trajectory.log", content.poses)
-    check_frames(open_dataset(folder), content, 1000.0, colored=True)
 
 
 @pytest.mark.parametrize("kind", ["PinholeCameraTrajectory", "PoseGraph"])
