@@ -1,13 +1,17 @@
 """Point clouds in bags: fields by name, rings, times, poses, images of beams and columns; and what is wrong
 with them."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bag_clouds import CAMERA, LIDAR, LOST, SCANS, T_BODY_LIDAR, drive, points, pose, send, stamp, write
-from inputs_bags import BODY, Kind, images, mounted, odometry, writing
+from inputs_bags import Bag, Kind, Make, mounted, plain, writing
 from numpy.typing import NDArray
+from point_clouds import in_order
 from refusals import bad_frame, refused
 
 from taichi_mrf.cli.main import main
@@ -17,6 +21,11 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
+
+
+def cloud(*what: Any, **more: Any) -> Callable[[Bag], None]:
+    """A part of a bag: one cloud."""
+    return lambda bag: send(bag, *what, **more)
 
 
 @pytest.mark.parametrize(("kind", "big"), [("ros1", False), ("sqlite", True), ("mcap", False)])
@@ -33,26 +42,22 @@ def test_a_cloud_with_rows_is_an_image(tmp_path: Path, kind: Kind, big: bool) ->
     assert "/points: images of 24 x 4 rays" in dataset.notes
 
 
-def test_rings_make_an_image_and_other_points_free_rays(tmp_path: Path) -> None:
-    ring = np.repeat(np.arange(4, dtype=np.uint16), 24)[::-1][None]
+def test_rings_make_an_image_and_other_points_free_rays(make: Make) -> None:
+    ring, known = np.repeat(np.arange(4, dtype=np.uint16), 24)[::-1][None], ~LOST.reshape(-1)
     flat = points(0).reshape(1, -1, 3)
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), flat, ring=ring)
-        send(bag, stamp(1), flat[:, ~LOST.reshape(-1)], ring=ring[:, ~LOST.reshape(-1)])
-        drive(bag)
-    image, free = open_dataset(tmp_path / "walk")
+    some = cloud(stamp(1), flat[:, known], ring=ring[:, known])
+    image, free = open_dataset(make(cloud(stamp(0), flat, ring=ring), some, drive, kind="mcap"))
     assert image.camera.shape == CAMERA.shape
     np.testing.assert_allclose(image.camera.rays(), CAMERA.rays(), atol=1e-5)
     assert isinstance(free.camera, RayTable)
     assert not free.camera.has_pattern
     assert free.no_return is None
-    found = (free.camera.rays() * free.depth_m[..., None]).reshape(-1, 3)
-    expected = flat[0][~LOST.reshape(-1)]
-    np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)
+    found = free.camera.rays() * free.depth_m[..., None]
+    np.testing.assert_allclose(in_order(found), in_order(flat[0][known]), atol=1e-5)
 
 
 @pytest.mark.parametrize("unit", ["t", "time", "timestamp"])
-def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
+def test_each_column_of_a_scan_has_its_pose(make: Make, unit: str) -> None:
     """Walls that stand still are seen from where the lidar is at the time of each column."""
     seconds = np.tile(np.linspace(-0.04, 0.04, 24), (4, 1))
     where = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds[0]])
@@ -65,10 +70,8 @@ def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
         "timestamp": 1_600_000_000.0 + stamp(0) + seconds,
     }
     first = stamp(0) - 0.04 if unit == "t" else stamp(0)  # unsigned: from the beginning of the scan
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, first, seen, **{unit: times[unit]})
-        drive(bag)
-    frame = open_dataset(tmp_path / "walk").read(0)
+    path = make(cloud(first, seen, **{unit: times[unit]}), drive, kind="mcap")
+    frame = open_dataset(path).read(0)
     T, camera = frame.T_world_camera, frame.camera
     assert isinstance(camera, RayTable)
     assert camera.has_pattern
@@ -78,18 +81,16 @@ def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
     assert off.max() < 0.02, "poses are interpolated on chords"
     starts = starts_at(camera, np.arange(24), 0) @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(starts, where[:, :3, 3], atol=1e-3)
-    skewed = open_dataset(f"{tmp_path / 'walk'}?deskew=false").read(0)
+    skewed = open_dataset(f"{path}?deskew=false").read(0)
     assert skewed.no_return is not None
     np.testing.assert_allclose(skewed.depth_m[~LOST], np.linalg.norm(seen, axis=-1)[~LOST], rtol=1e-5)
 
 
-def test_free_rays_start_where_their_points_were_measured(tmp_path: Path) -> None:
+def test_free_rays_start_where_their_points_were_measured(make: Make) -> None:
     flat = points(0)[~LOST][None]
     seconds = np.linspace(-0.04, 0.04, flat.shape[1], dtype=np.float32)
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), flat, time=seconds[None])
-        drive(bag)
-    frame = open_dataset(tmp_path / "walk").read(0)
+    path = make(cloud(stamp(0), flat, time=seconds[None]), drive, kind="mcap")
+    frame = open_dataset(path).read(0)
     assert isinstance(frame.camera, RayTable)
     assert not frame.camera.has_pattern
     poses = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds])
@@ -125,15 +126,10 @@ def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(tmp_path: Path, wit
         np.testing.assert_allclose(np.sort(frame.depth_m[frame.depth_m > 0]), np.sort(expected), rtol=1e-5)
 
 
-def test_depth_images_come_first_and_points_can_be_chosen(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        images(bag)
-        odometry(bag)
-        mounted(bag)
-        send(bag, stamp(0), points(0))
-        bag.tf("/tf_static", 0.0, BODY, LIDAR, T_BODY_LIDAR)
-    assert open_dataset(tmp_path / "walk").read(0).depth_m.shape == (12, 16)
-    chosen = open_dataset(f"{tmp_path / 'walk'}?points=/points")
+def test_depth_images_come_first_and_points_can_be_chosen(make: Make) -> None:
+    path = make(plain, cloud(stamp(0), points(0)), partial(mounted, child=LIDAR, T=T_BODY_LIDAR), kind="mcap")
+    assert open_dataset(path).read(0).depth_m.shape == (12, 16)
+    chosen = open_dataset(f"{path}?points=/points")
     assert chosen.read(0).camera.shape == CAMERA.shape
 
 
@@ -146,36 +142,31 @@ def test_info_lists_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert f"taichi-mrf map {path} --out DIR" in printed
 
 
-def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
-    with writing(tmp_path / "two", "mcap") as bag:
-        send(bag, 1.0, points(0), "/front/points")
-        send(bag, 1.0, points(0), "/rear/points")
-        drive(bag)
+def test_what_cannot_be_opened_is_named(make: Make, tmp_path: Path) -> None:
+    two = make(
+        cloud(1.0, points(0), "/front/points"),
+        cloud(1.0, points(0), "/rear/points"),
+        drive,
+        kind="mcap",
+        name="two",
+    )
     refused(
-        tmp_path / "two",
+        two,
         "several topics of point clouds: choose one with ?points=/front/points or ?points=/rear/points",
     )
-    refused(f"{tmp_path / 'two'}?points=/odom", "topic /odom is of type nav_msgs/msg/Odometry")
+    refused(f"{two}?points=/odom", "topic /odom is of type nav_msgs/msg/Odometry")
     path = write(tmp_path)
     refused(path, "contains lidar scans; --depth-scale is for depth images", depth_scale=5.0)
-    with writing(tmp_path / "late", "mcap") as bag:
-        send(bag, 50.0, points(0))
-        drive(bag)
-    refused(tmp_path / "late", "none of 1 clouds of /points")
+    late = make(cloud(50.0, points(0)), drive, kind="mcap", name="late")
+    refused(late, "none of 1 clouds of /points")
 
 
-def test_a_broken_cloud_is_named_and_the_others_are_read(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
-        send(bag, stamp(1), points(1))
-        drive(bag)
-    dataset = open_dataset(tmp_path / "walk")
+def test_a_broken_cloud_is_named_and_the_others_are_read(make: Make) -> None:
+    broken = cloud(stamp(0), np.full((4, 24, 3), np.nan))
+    dataset = open_dataset(make(broken, cloud(stamp(1), points(1)), drive, kind="mcap"))
     bad_frame(dataset, 0, "topic /points: none of 96 points is a measurement")
     assert dataset.camera == dataset.read(1).camera
-    with writing(tmp_path / "none", "mcap") as bag:
-        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
-        drive(bag)
-    refused(tmp_path / "none", "no cloud can be read: frame 000000")
+    refused(make(broken, drive, kind="mcap"), "no cloud can be read: frame 000000")
 
 
 class Message:
