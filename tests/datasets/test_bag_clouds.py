@@ -278,10 +278,7 @@ def test_points_in_no_order_are_no_image() -> None:
     assert organised(np.random.default_rng(2).permutation(points).reshape(6, 32, 3)) is None
     assert organised(points[None]) is None
     assert organised(np.full((6, 32, 3), np.nan)) is None
-
-
-def test_a_part_of_a_turn_whose_rows_are_ahead_is_no_image() -> None:
-    part = scan(lidar())[:, :12]
+    part = scan(lidar())[:, :12]  # of a turn
     assert organised(part) is not None
     assert organised(np.stack([np.roll(row, 2 * i, axis=0) for i, row in enumerate(part)])) is None
 

@@ -11,7 +11,6 @@ import pytest
 from datasets_recordings import (
     Content,
     row_of,
-    stamped_line,
     text_of,
     write_image,
     write_log,
@@ -35,11 +34,17 @@ def folder(tmp_path: Path) -> Path:
     return write_seven_scenes(tmp_path / "office", Content())
 
 
-def test_folders_without_a_recording(tmp_path: Path) -> None:
+def test_sources_without_a_recording(tmp_path: Path) -> None:
+    refused("synthetic:rooms", "did you mean 'synthetic:room'")
+    refused("nonsense:whatever", "built-in sources are: synthetic:room")
     refused(tmp_path / "nowhere", str(tmp_path / "nowhere"), "synthetic:room")
     refused(tmp_path, str(tmp_path), "is empty", "frame-NNNNNN.depth.png", "groundtruth.txt", ".log")
     (tmp_path / "holiday.odt").write_bytes(b"")
     refused(tmp_path, str(tmp_path), "frame-NNNNNN.depth.png")
+    for name in ("pose", "depth"):  # the folders of ScanNet, with depth of another kind
+        (tmp_path / name).mkdir()
+    (tmp_path / "depth" / "0.exr").write_bytes(b"something")
+    refused(tmp_path, "not read (0.exr)")
 
 
 UNREAD = {
@@ -85,26 +90,13 @@ def test_depth_images_of_other_names(tmp_path: Path, suffix: str) -> None:
     refused(tmp_path / f"view0{suffix}", f"is one image of depth (view0{suffix})")
 
 
-def test_poses_and_points_alone(tmp_path: Path) -> None:
+def test_a_file_of_a_recording_alone(folder: Path, tmp_path: Path) -> None:
+    said = "unsupported file type; for a recording of many files pass its folder"
+    refused(folder / "camera.txt", str(folder / "camera.txt"), said)
     (tmp_path / "poses.csv").write_text("timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
     refused(tmp_path / "poses.csv", f"with --poses {tmp_path / 'poses.csv'}")
     cloud = write_ply(tmp_path / "cloud.ply", np.zeros((3, 3)))
     refused(cloud, "contains lidar point clouds without poses")
-
-
-def test_depth_of_another_kind_in_scannet_s_folders(tmp_path: Path) -> None:
-    (tmp_path / "pose").mkdir()
-    (tmp_path / "depth").mkdir()
-    (tmp_path / "depth" / "0.exr").write_bytes(b"something")
-    refused(tmp_path, "not read (0.exr)")
-
-
-def test_a_file_in_place_of_a_folder(folder: Path) -> None:
-    refused(
-        folder / "camera.txt",
-        str(folder / "camera.txt"),
-        "unsupported file type; for a recording of many files pass its folder",
-    )
 
 
 @pytest.mark.parametrize("name", ["walk.log", "walk.log.gz", "scans.npz", "folder"])
@@ -149,11 +141,6 @@ def write_frame_text(path: Path) -> None:
 def test_a_folder_of_recordings_names_them(folder: Path) -> None:
     shutil.copytree(folder, folder.parent / "attic")
     assert "attic, office" in refused(folder.parent).split("contains several recordings; pass one of: ")[1]
-
-
-def test_a_built_in_that_does_not_exist() -> None:
-    refused("synthetic:rooms", "did you mean 'synthetic:room'")
-    refused("nonsense:whatever", "built-in sources are: synthetic:room")
 
 
 @pytest.mark.parametrize(
@@ -220,21 +207,15 @@ def test_tum_lists_that_are_broken(tmp_path: Path, name: str, lines: str, proble
     refused(tmp_path, str(tmp_path / name), problem)
 
 
-def test_numbered_images_without_a_trajectory_or_with_two(tmp_path: Path) -> None:
+def test_numbered_images_whose_trajectory_does_not_fit(tmp_path: Path) -> None:
     content = Content()
     write_numbered(tmp_path, content)
     refused(tmp_path, "without a trajectory")
-    write_rows(tmp_path / "a.txt", content.poses)
-    write_log(tmp_path / "b.log", content.poses)
-    refused(tmp_path, "a.txt, b.log; keep one")
-
-
-def test_numbered_images_that_no_stamp_names(tmp_path: Path) -> None:
-    write_numbered(tmp_path, Content())
-    (tmp_path / "traj.txt").write_text(stamped_line(1305031102.5, np.eye(4)))
-    refused(
-        tmp_path, f"{tmp_path / 'traj.txt'}: its stamps are times, images are numbered, and there are 5 of"
-    )
+    path = write_stamped(tmp_path / "traj.txt", [1305031102.5], [np.eye(4)])
+    refused(tmp_path, f"{path}: its stamps are times, images are numbered, and there are 5 of")
+    write_rows(tmp_path / "traj.txt", content.poses)
+    write_log(tmp_path / "two.log", content.poses)
+    refused(tmp_path, "traj.txt, two.log; keep one")
 
 
 # Frame 3 of a 7-Scenes recording is damaged in turn; the error has to name it and the file.

@@ -33,7 +33,6 @@ from inputs_bags import (
     stamped_poses,
     steps,
     world_body,
-    writing,
 )
 from inputs_frames import moved
 from refusals import bad_frame, refused
@@ -339,11 +338,6 @@ def test_rectified_images_have_the_projections_camera(make: Make) -> None:
     assert open_dataset(f"{path}?depth=/camera/image_raw").camera == CAMERA
 
 
-def test_a_lens_that_is_not_opencvs_is_named(make: Make) -> None:
-    path = make(uninformed, own_poses, informed(CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant"))
-    refused(path, INFO, "'equidistant'", "--undistort 0,0,0,0")
-
-
 def test_without_a_camera_the_user_can_give_one(make: Make) -> None:
     path = make(uninformed, odometry, mounted)
     refused(path, "--camera fx,fy,cx,cy")
@@ -383,12 +377,6 @@ def test_each_image_has_the_camera_of_its_time(make: Make) -> None:
     assert f"the camera changes {len(set(cameras)) - 1} times, by its CameraInfo" in dataset.notes
 
 
-def test_a_distorted_camera_that_changes_is_refused(make: Make) -> None:
-    cameras = [informed(each, LENS, stamp=stamp(i)) for i, each in enumerate((CAMERA, OTHER))]
-    said = f"the camera changes at {START + stamp(1):.3f} s and its lens is distorted; --camera"
-    refused(make(uninformed, own_poses, *cameras), said)
-
-
 def only_color(bag: Bag) -> None:
     bag.camera_info("/camera/color/camera_info", FRAME, CAMERA)
     bag.image("/camera/color/image_raw", 1.0, FRAME, np.zeros((12, 16, 3), np.uint8), "rgb8")
@@ -416,6 +404,21 @@ BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
     "no such option": ((plain,), "?topic=/odom", ("unknown parameter 'topic'",)),
     "no such body": ((plain,), "?body=trailer", ("no frame 'trailer'",)),
     "uncalibrated": ((uninformed, own_poses, send_zeros), "", (INFO, "not calibrated", "--camera")),
+    "a lens that is not OpenCV's": (
+        (uninformed, own_poses, informed(CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant")),
+        "",
+        (INFO, "'equidistant'", "--undistort 0,0,0,0"),
+    ),
+    "a distorted camera that changes": (
+        (
+            uninformed,
+            own_poses,
+            informed(CAMERA, LENS, stamp=stamp(0)),
+            informed(OTHER, LENS, stamp=stamp(1)),
+        ),
+        "",
+        (f"the camera changes at {START + stamp(1):.3f} s and its lens is distorted; --camera",),
+    ),
     "of Intel's library": (
         (partial(uninformed, topic="/device_0/sensor_0/Depth_0/image/data"),),
         "",
@@ -466,42 +469,3 @@ def test_messages_of_one_moment_are_kept_apart(make: Make, kind: Kind) -> None:
     dataset = open_dataset(make(mounted, own_poses, informed(), burst, kind=kind))
     for i in (4, 0, 2):
         np.testing.assert_array_equal(dataset.read(i).depth_m, steps(i).astype(np.float32) / np.float32(1000))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    "names",
-    [("walk_0", "walk_1"), ("2026-11-25-10-00-00_0", "2026-11-25-10-00-03_1"), ("walk_3", "walk_4")],
-    ids=["numbers", "times", "the first files are gone"],
-)
-def test_the_files_of_a_split_recording_are_read_together(
-    make: Make, tmp_path: Path, kind: Kind, names: tuple[str, str]
-) -> None:
-    """The mounting is in the first file only."""
-    folder = tmp_path / "rec"
-    folder.mkdir()
-    for name, half in zip(names, (range(COUNT // 2), range(COUNT // 2, COUNT)), strict=True):
-        parts = [partial(images, info=False, numbers=half), partial(odometry, numbers=half)]
-        first = [mounted] if half[0] == 0 else []
-        data = data_file(make(*first, informed(stamp=stamp(half[0])), *parts, kind=kind, name=name))
-        data.rename(folder / (name + data.suffix))
-    dataset = open_dataset(folder)
-    suffix = data.suffix
-    assert f"{names[0]}{suffix} to {names[1]}{suffix}: 2 files are read as one recording" in dataset.notes
-    check_poses(dataset)
-    for i in range(COUNT):
-        np.testing.assert_allclose(dataset.read(i).depth_m, steps(i) / 1000, rtol=1e-6)
-
-
-def test_numbered_bags_that_do_not_follow_each_other_are_several(tmp_path: Path) -> None:
-    for number, later in enumerate((0.0, 60.0)):
-        with writing(tmp_path / f"run_{number}.bag", "ros1") as bag:
-            bag.image(TOPIC, later, FRAME, steps(0), "16UC1")
-    said = "contains several recordings (run_1.bag begins 60.0 s after the end of the one before)"
-    refused(tmp_path, said, "pass one of: run_0.bag, run_1.bag")
-
-
-def test_a_folder_of_bags_names_them(make: Make, tmp_path: Path) -> None:
-    make(plain)
-    make(plain, kind="mcap", name="second")
-    assert refused(tmp_path).endswith("pass one of: second, walk.bag")

@@ -21,7 +21,6 @@ from taichi_mrf.datasets.synthetic.mesh_scene import (
     scene_mesh,
 )
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
-from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
@@ -91,9 +90,6 @@ def test_a_ray_that_meets_nothing_has_no_depth() -> None:
     np.testing.assert_allclose(depth[x < 0.499], 2.5, atol=1e-6)
     assert (depth[x > 0.501] == 0).all()
     assert (scene.render_depth(CAMERA, look_at((3, 0, 0), (9, 0, 0))) == 0).all()
-
-
-def test_a_mesh_without_triangles_is_met_by_no_ray() -> None:
     nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     assert (MeshScene(nothing).render_depth(CAMERA, np.eye(4)) == 0).all()
 
@@ -207,16 +203,15 @@ def test_wrong_options(files: tuple[Path, Path], query: str, problem: str) -> No
     refused(f"mesh:{files[0]}{query.format(poses=files[1])}", problem)
 
 
-def test_a_depth_scale_has_no_meaning_here(files: tuple[Path, Path]) -> None:
-    refused(f"mesh:{files[0]}?poses={files[1]}", "depth_scale", depth_scale=5000)
-
-
 def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
     query = f"?poses={files[1]}"
     refused(f"mesh:{query}", "needs a file")
     refused(f"mesh:{tmp_path / 'gone.ply'}{query}", f"{tmp_path / 'gone.ply'}: the mesh is missing")
     (tmp_path / "folder.ply").mkdir()
     refused(f"mesh:{tmp_path / 'folder.ply'}{query}", "folder.ply: is not a file")
+    refused(f"mesh:{files[0]}{query}", "depth_scale", depth_scale=5000)
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
+    refused(f"mesh:{tmp_path / 'cloud.ply'}{query}", "cloud.ply: contains no triangles")
     contents = {
         "nonsense.ply": (b"this is no mesh", "cannot be read as a mesh"),
         "cut.ply": (files[0].read_bytes()[:250], "cannot be read as a mesh"),
@@ -235,13 +230,6 @@ def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
         assert text.startswith(str(path))
         assert problem in text
         assert len(text) < 1000
-
-
-def test_points_without_triangles(tmp_path: Path) -> None:
-    path = tmp_path / "cloud.ply"
-    trimesh.PointCloud(np.eye(3)).export(path)
-    with pytest.raises(DatasetError, match=r"cloud\.ply: contains no triangles"):
-        load_mesh(path)
 
 
 def test_a_bad_pose_costs_its_own_frame_only(files: tuple[Path, Path]) -> None:

@@ -1,5 +1,5 @@
-"""Bags that are not as a recorder of ROS 2 leaves them, and data in the world's frame, each read or refused
-with the remedy."""
+"""Bags that are not as a recorder of ROS 2 leaves them, recordings in several files, and data in the world's
+frame, each read or refused with the remedy."""
 
 import struct
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from inputs_bags import (
     START,
     TOPIC,
     Bag,
+    Kind,
     Make,
     T_body_camera,
     check_poses,
@@ -301,3 +302,43 @@ def test_poses_of_a_camera_link_are_turned_if_images_agree_so(make: Make, source
     for frame_read, T in zip(dataset, EYES, strict=True):
         np.testing.assert_allclose(frame_read.T_world_camera, T, atol=1e-6)
     assert any("of a body, x ahead and z up" in note for note in dataset.notes) == is_body
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+@pytest.mark.parametrize(
+    "names",
+    [("walk_0", "walk_1"), ("2026-11-25-10-00-00_0", "2026-11-25-10-00-03_1"), ("walk_3", "walk_4")],
+    ids=["numbers", "times", "the first files are gone"],
+)
+def test_the_files_of_a_split_recording_are_read_together(
+    make: Make, tmp_path: Path, kind: Kind, names: tuple[str, str]
+) -> None:
+    """The mounting is in the first file only."""
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    for name, half in zip(names, (range(COUNT // 2), range(COUNT // 2, COUNT)), strict=True):
+        informed = partial(Bag.camera_info, topic=INFO, frame=FRAME, camera=CAMERA, stamp=stamp(half[0]))
+        parts = [informed, partial(images, info=False, numbers=half), partial(odometry, numbers=half)]
+        first = [mounted] if half[0] == 0 else []
+        data = data_file(make(*first, *parts, kind=kind, name=name))
+        data.rename(folder / (name + data.suffix))
+    dataset = open_dataset(folder)
+    suffix = data.suffix
+    assert f"{names[0]}{suffix} to {names[1]}{suffix}: 2 files are read as one recording" in dataset.notes
+    check_poses(dataset)
+    for i in range(COUNT):
+        np.testing.assert_allclose(dataset.read(i).depth_m, steps(i) / 1000, rtol=1e-6)
+
+
+def test_numbered_bags_that_do_not_follow_each_other_are_several(tmp_path: Path) -> None:
+    for number, later in enumerate((0.0, 60.0)):
+        with writing(tmp_path / f"run_{number}.bag", "ros1") as bag:
+            bag.image(TOPIC, later, FRAME, steps(0), "16UC1")
+    said = "contains several recordings (run_1.bag begins 60.0 s after the end of the one before)"
+    refused(tmp_path, said, "pass one of: run_0.bag, run_1.bag")
+
+
+def test_a_folder_of_bags_names_them(make: Make, tmp_path: Path) -> None:
+    make(plain)
+    make(plain, kind="mcap", name="second")
+    assert refused(tmp_path).endswith("pass one of: second, walk.bag")

@@ -32,8 +32,10 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return write_record3d(tmp_path / request.param, CONTENT)
 
 
-def check_frames(path: Path) -> None:
-    dataset = open_dataset(path)
+@pytest.mark.parametrize("name", ["walk.r3d", "walk"])
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_what_was_recorded_comes_back(tmp_path: Path, name: str, is_packed: bool) -> None:
+    dataset = open_dataset(write_record3d(tmp_path / name, CONTENT, packer() if is_packed else bytes))
     assert (len(dataset), dataset.dropped, dataset.name) == (3, 0, "walk")
     assert dataset.camera == CAMERA
     for i, frame in enumerate(dataset):
@@ -44,15 +46,6 @@ def check_frames(path: Path) -> None:
         # The middle of a depth pixel is the corner that its four colour pixels share.
         np.testing.assert_allclose(frame.color[measured], np.maximum(CONTENT.color[i], 0)[measured], atol=1)
         assert not frame.color[~measured].any()
-
-
-def test_what_was_recorded_comes_back(path: Path) -> None:
-    check_frames(path)
-
-
-@pytest.mark.parametrize("name", ["walk.r3d", "walk"])
-def test_packed_depth_and_confidence_come_back(tmp_path: Path, name: str) -> None:
-    check_frames(write_record3d(tmp_path / name, CONTENT, packer()))
 
 
 def test_confidence_is_a_sigma(path: Path) -> None:

@@ -327,8 +327,6 @@ def test_a_file_that_is_no_description(tmp_path: Path, text: str) -> None:
 
 def test_poses_that_do_not_fit(tmp_path: Path) -> None:
     path = write(tmp_path, NAMES)
-    write_rows(tmp_path / "poses.txt", [pose(0)])
-    refused(path, "poses.txt: contains 1 poses for 3 stereo pairs")
     write_stamped(tmp_path / "poses.txt", [0.0], [pose(0)])
     refused(path, "poses.txt: has stamps, but the images have none")
     refused(path, "depth_scale", depth_scale=1000.0)
