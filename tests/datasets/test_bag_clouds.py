@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_clouds import CAMERA, LIDAR, LOST, SCANS, T_BODY_LIDAR, drive, points, pose, send, stamp, write
-from inputs_bags import Bag, Kind, Make, mounted, plain, writing
+from inputs_bags import Bag, Kind, Make, mounted, plain
 from numpy.typing import NDArray
 from point_clouds import in_order
 from refusals import bad_frame, refused
@@ -101,24 +101,27 @@ def test_free_rays_start_where_their_points_were_measured(make: Make) -> None:
     assert np.ptp(frame.camera.origins_m[..., 0]) > 0.05
 
 
-def test_a_lidar_that_stands_still_keeps_its_image(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, 1.0, points(0), t=np.tile(np.arange(24, dtype=np.uint32) * 4_000_000, (4, 1)))
+def test_a_lidar_that_stands_still_keeps_its_image(make: Make) -> None:
+    def still(bag: Bag) -> None:
         for i in range(5):
             bag.odometry("/odom", 0.9 + 0.1 * i, "odom", LIDAR, np.eye(4))
-    assert open_dataset(tmp_path / "walk").read(0).camera.shape == CAMERA.shape
+
+    times = np.tile(np.arange(24, dtype=np.uint32) * 4_000_000, (4, 1))
+    path = make(cloud(1.0, points(0), t=times), still, kind="mcap")
+    assert open_dataset(path).read(0).camera.shape == CAMERA.shape
 
 
 @pytest.mark.parametrize("with_tf", [False, True])
-def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(tmp_path: Path, with_tf: bool) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        for scan in range(SCANS):
-            T_odom_lidar = pose(stamp(scan))
-            send(bag, stamp(scan), points(scan) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3], frame="odom")
-            bag.odometry("/odom", stamp(scan), "odom", "body", T_odom_lidar)
+def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(make: Make, with_tf: bool) -> None:
+    def walk(bag: Bag) -> None:
+        for at, xyz in ((stamp(scan), points(scan)) for scan in range(SCANS)):
+            T_odom_lidar = pose(at)
+            send(bag, at, xyz @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3], frame="odom")
+            bag.odometry("/odom", at, "odom", "body", T_odom_lidar)
             if with_tf:
-                bag.tf("/tf", stamp(scan), "odom", "body", T_odom_lidar)
-    dataset = open_dataset(tmp_path / "walk")
+                bag.tf("/tf", at, "odom", "body", T_odom_lidar)
+
+    dataset = open_dataset(make(walk, kind="mcap"))
     assert any("of body, from where the data were moved to odom" in note for note in dataset.notes)
     for scan, frame in enumerate(dataset):
         np.testing.assert_allclose(frame.T_world_camera, pose(stamp(scan)), atol=1e-9)

@@ -148,7 +148,8 @@ def test_the_sigma_of_the_l515_is_the_makers_error_and_noise_together() -> None:
 
 
 def test_an_image_without_confidence_has_the_same_sigma_everywhere(make: Make) -> None:
-    dataset = open_dataset(make(plain, lambda bag: confidence(bag, skip=3)), color=False)
+    path = make(plain, partial(confidence, skip=3))
+    dataset = open_dataset(path, color=False)
     assert dataset.read(3).sigma_m is None
     assert dataset.read(4).sigma_m is not None
     assert any(note.endswith("; 1 of 5 images have none") for note in dataset.notes)
@@ -174,19 +175,16 @@ def test_confidence_that_does_not_fit_is_named(
     refused(source, f"{path}: topic {CONFIDENCE}: ", problem)
 
 
-def test_a_topic_of_another_name_can_be_named(make: Make) -> None:
-    path = make(plain, lambda bag: confidence(bag, "/trust"))
+def test_a_topic_of_another_name_can_be_named_and_of_two_one_must_be(make: Make) -> None:
+    path = make(plain, partial(confidence, topic="/trust"))
     dataset = open_dataset(f"{path}?confidence=/trust", color=False)
     np.testing.assert_allclose(dataset.read(1).sigma_m, expected(1), rtol=1e-6)
     refused(f"{path}?confidence=/odom", "is of type nav_msgs/msg/Odometry, not")
     refused(f"{path}?confidence=/nothing", "there is no topic /nothing; topics of confidence: none")
-
-
-def test_of_two_topics_one_must_be_chosen(make: Make) -> None:
     other = "/camera/confidence/image_raw"
-    dataset = open_dataset(make(plain, confidence, lambda bag: confidence(bag, other)), color=False)
-    assert dataset.read(0).sigma_m is None
-    assert f"confidence: choose one with ?confidence={other} or ?confidence={CONFIDENCE}" in dataset.notes
+    two = open_dataset(make(plain, confidence, partial(confidence, topic=other)), color=False)
+    assert two.read(0).sigma_m is None
+    assert f"confidence: choose one with ?confidence={other} or ?confidence={CONFIDENCE}" in two.notes
 
 
 def test_a_later_image_that_is_damaged_is_a_bad_frame(make: Make) -> None:

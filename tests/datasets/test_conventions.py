@@ -10,7 +10,6 @@ from broken_recordings import body, opengl, w_first
 from datasets_recordings import (
     CAMERA,
     Content,
-    stamped_line,
     write_image,
     write_log,
     write_rows,
@@ -90,11 +89,9 @@ def test_poses_of_a_file_have_conventions_and_an_origin_too(tmp_path: Path) -> N
     content = Content()
     folder = write_tum(tmp_path / "recording", content)
     stamps = open_dataset(folder, camera=CAMERA).stamps()
-    lines = [
-        stamped_line(s + 0.25, inverse(moved(T, ORIGIN))) for s, T in zip(stamps, content.poses, strict=True)
-    ]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
-    dataset = open_posed(folder, tmp_path / "poses.txt", poses_are="inverse,late=0.25", camera=CAMERA)
+    inverses = [inverse(moved(T, ORIGIN)) for T in content.poses]
+    poses = write_stamped(tmp_path / "poses.txt", np.array(stamps) + 0.25, inverses)
+    dataset = open_posed(folder, poses, poses_are="inverse,late=0.25", camera=CAMERA)
     found = [moved(dataset.pose(i), dataset.origin_m) for i in range(5)]
     assert np.allclose(found, [moved(T, ORIGIN) for T in content.poses], atol=1e-5)
     assert np.array_equal(dataset.read(3).T_world_camera, dataset.pose(3))

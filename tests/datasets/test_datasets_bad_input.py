@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from datasets_recordings import (
     Content,
-    row_of,
     text_of,
     write_image,
     write_log,
@@ -120,7 +119,7 @@ def test_poses_in_a_file_for_each_image_name_the_flags(tmp_path: Path, layout: s
         write_image(tmp_path / f"{number:04d}.png", image)
         write_frame_text(tmp_path / layout.replace("NNNN", f"{number:04d}"))
     refused(tmp_path, "--camera 14.5,15,7.5,5.5 and --depth-scale", "poses.txt")
-    (tmp_path / "poses.txt").write_text("\n".join(row_of(np.eye(4)[:3]) for _ in content.depth))
+    write_rows(tmp_path / "poses.txt", [np.eye(4)] * content.count)
     flags = {"intrinsics": (14.5, 15, 7.5, 5.5), "depth_scale": 1000.0}
     assert len(open_dataset(tmp_path, **flags)) == content.count  # type: ignore[arg-type]
 

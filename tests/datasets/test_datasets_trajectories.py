@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import stamped_line
+from datasets_recordings import write_stamped
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from inputs_frames import slerp
@@ -359,8 +359,7 @@ def test_of_two_poses_with_one_stamp_the_last_counts() -> None:
 
 
 def test_a_file_of_stamped_poses(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text("\n".join(stamped_line(s, T) for s, T in zip(STAMPS, ramp().poses, strict=True)))
+    path = write_stamped(tmp_path / "poses.txt", STAMPS, ramp().poses)
     found = read_timed_poses(path)
     np.testing.assert_allclose(found.poses, ramp().poses, atol=1e-9)
     np.testing.assert_array_equal(found.stamps, STAMPS)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets_recordings import stamped_line
+from datasets_recordings import write_stamped
 from moving_lidar import lidar
 from numpy.typing import NDArray
 from point_clouds import LasFile, las_head
@@ -140,6 +140,7 @@ def test_free_rays_have_poses_of_their_own() -> None:
 
 
 COUNT, START = 60, 1000.0
+ENDS = START - 0.05, START + 0.4
 FIRST, LAST = look_at([0.0, 0, 1], [5.0, 0, 1]), look_at([2.0, 1, 1], [5.0, 3, 2])
 TIMES = START + np.linspace(0.0, 0.29, COUNT)
 """Three scans of a tenth of a second, 20 points or so in each, in the order of time."""
@@ -161,12 +162,9 @@ def survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         file = LasFile(points_m + offset_m, times)
         monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda stream, closefd: file))
         (tmp_path / "walk.las").write_bytes(las_head(len(points_m)))
-        lines = []
-        for stamp, pose in ((START - 0.05, FIRST), (START + 0.4, LAST)):
-            T = pose.copy()
-            T[:3, 3] += offset_m
-            lines.append(stamped_line(stamp, T))
-        (tmp_path / poses).write_text("\n".join(lines))
+        ends = np.array([FIRST, LAST])
+        ends[:, :3, 3] += offset_m
+        write_stamped(tmp_path / poses, ENDS, ends)
         return tmp_path / "walk.las"
 
     return write
@@ -260,8 +258,7 @@ def test_a_survey_as_laspy_writes_it(tmp_path: Path, suffix: str) -> None:
     file.x, file.y, file.z = POINTS[SHUFFLED].T
     file.gps_time = TIMES[SHUFFLED]
     file.write(tmp_path / f"walk{suffix}")
-    lines = [stamped_line(START - 0.05, FIRST), stamped_line(START + 0.4, LAST)]
-    (tmp_path / "walk.txt").write_text("\n".join(lines))
+    write_stamped(tmp_path / "walk.txt", ENDS, [FIRST, LAST])
     dataset = open_dataset(tmp_path / f"walk{suffix}", max_time_gap=1.0)
     first = POINTS[TIMES < START + 0.1]
     np.testing.assert_allclose(world_points(dataset, 0), first[np.lexsort(first.T)], atol=1e-3)

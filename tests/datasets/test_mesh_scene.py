@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from console import taichi_mrf
-from datasets_recordings import row_of
+from datasets_recordings import write_rows
 from numpy.typing import NDArray
 from refusals import bad_frame, refused
 
@@ -64,10 +64,9 @@ def depth_in_box(camera: PinholeCamera, T: NDArray[np.float64], extents: tuple[f
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
     """A room as a PLY file and two poses in it."""
-    mesh, poses = tmp_path / "room.ply", tmp_path / "poses.txt"
+    mesh = tmp_path / "room.ply"
     trimesh.creation.box(ROOM).export(mesh)
-    poses.write_text("\n".join(row_of(T[:3]) for T in POSES))
-    return mesh, poses
+    return mesh, write_rows(tmp_path / "poses.txt", POSES)
 
 
 @pytest.mark.parametrize("T", POSES)

@@ -27,7 +27,6 @@ from datasets_recordings import (
 from refusals import refused
 
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.errors import DatasetError
 
 CONTENT = Content()
 
@@ -214,7 +213,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "JSON": (jsons, "5 files such as frame_00000.json may hold.*--poses-are opengl"),
     "nerfstudio": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json.*--poses-are opengl"),
-    "depth as npy": (npy, "format that is not read .0.npy"),
+    "depth as npy": (npy, "format that is not read (0.npy"),
     "raw KITTI": (
         lambda f: (shutil.rmtree(f / "depth"), (f / "oxts").mkdir()),
         "raw recording of KITTI's, whose oxts/ holds latitudes",
@@ -248,8 +247,7 @@ def test_what_is_missing_is_named_with_the_remedy(tmp_path: Path, case: str) -> 
     shutil.rmtree(tmp_path / "color")
     change, words = REFUSED[case]
     change(tmp_path)
-    with pytest.raises(DatasetError, match=words):
-        open_dataset(tmp_path)
+    refused(tmp_path, *words.split(".*"))
 
 
 @pytest.mark.parametrize("scale", [None, 1.0, 1000.0])
@@ -278,5 +276,4 @@ def test_a_saved_map_is_no_recording(tmp_path: Path, name: str, words: str) -> N
         (tmp_path / folder).mkdir()
     (tmp_path / "room.zarr/zarr.json").write_text("{}")
     np.savez(tmp_path / "out/map.npz", format=np.array(2), keyframe_ids=np.zeros(0, int))
-    with pytest.raises(DatasetError, match=words):
-        open_dataset(tmp_path / name)
+    refused(tmp_path / name, *words.split(" .* "))

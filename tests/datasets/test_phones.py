@@ -238,20 +238,16 @@ def test_depth_poses_and_camera(stray: Path) -> None:
 
 
 def test_confidence_of_stray_scanner_is_a_sigma(stray: Path) -> None:
-    dataset = open_dataset(stray)
-    sigma_m = dataset.read(0).sigma_m
-    np.testing.assert_allclose(sigma_m[:, :3], np.tile([np.inf, 0.02, 0.01], (192, 1)), rtol=1e-6)
-    applied = with_recorded_noise(Config(), dataset)
-    assert applied.sensor == SensorConfig(sigma=(0.01,))
-    assert any("assumed for a phone's lidar" in note for note in dataset.notes)
-
-
-def test_without_confidence_the_sigma_is_that_of_the_format(stray: Path) -> None:
     (stray / "confidence" / "000001.png").unlink()
     dataset = open_dataset(stray)
+    np.testing.assert_allclose(
+        dataset.read(0).sigma_m[:, :3], np.tile([np.inf, 0.02, 0.01], (192, 1)), rtol=1e-6
+    )
     assert dataset.stated.pixel_sigma
-    assert dataset.read(1).sigma_m is None
+    assert dataset.read(1).sigma_m is None  # it has that of the format
     assert dataset.read(2).sigma_m is not None
+    assert with_recorded_noise(Config(), dataset).sensor == SensorConfig(sigma=(0.01,))
+    assert any("assumed for a phone's lidar" in note for note in dataset.notes)
 
 
 def test_images_of_stray_scanner_without_a_pose_are_dropped(stray: Path) -> None:

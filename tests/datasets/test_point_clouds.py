@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from console import carry_out
-from datasets_recordings import row_of
+from datasets_recordings import row_of, write_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_clouds import LasFile, Points, RoomWalk, Walk, las_head, lzf, write_pcd, write_ply
@@ -322,7 +322,7 @@ def write(folder: Path, suffix: str, clouds: list[Points], poses: list[Pose] | N
     for i, cloud in enumerate(clouds):
         WRITERS[suffix](folder / f"scan{i}.{suffix}", cloud)
     if poses is not None:
-        (folder / "poses.txt").write_text("\n".join(row_of(T[:3]) for T in poses))
+        write_rows(folder / "poses.txt", poses)
     return folder
 
 
@@ -414,7 +414,7 @@ def two_rooms() -> Points:
 def test_a_cloud_that_is_a_map_is_refused(tmp_path: Path, suffix: str) -> None:
     folder = write(tmp_path / "walk", suffix, [two_rooms()])
     refused(folder / f"scan0.{suffix}", "poses")
-    (folder / "poses.txt").write_text("\n".join(row_of(T[:3]) for T in ROOM.poses))
+    write_rows(folder / "poses.txt", ROOM.poses)
     refused(folder, "poses.txt: contains 6 poses for one cloud, scan0")
 
 

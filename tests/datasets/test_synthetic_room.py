@@ -250,6 +250,9 @@ def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
 def test_options_and_defaults() -> None:
     room = open_dataset("synthetic:room")
     assert len(room) == len(room.frame_names) == 32
+    assert room.moving_scene is None
+    assert room.scene_at(3) is room.scene
+    assert room.stamp_at(5) == 1.0
     assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
     assert len(open_dataset("synthetic:room?frames=7&seed=3&noise=none")) == 7
     assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
@@ -451,10 +454,3 @@ def test_frames_show_what_is_there_at_their_time(one_backend: str) -> None:
         shown.append((np.abs(distance_to_solids(ball.solids_at(25), points)) < 1e-4).sum())
     assert shown[0] == 0
     assert shown[1] > 50
-
-
-def test_a_room_without_motion_is_the_furnished_room() -> None:
-    room = open_dataset("synthetic:room", color=False)
-    assert room.moving_scene is None
-    assert room.scene_at(3) is room.scene
-    assert room.stamp_at(5) == 1.0
