@@ -258,7 +258,8 @@ def test_what_may_be_left_out_and_what_may_be_added(tmp_path: Path) -> None:
 
 
 def test_intrinsics_of_the_caller_change_the_sigma(tmp_path: Path) -> None:
-    told = open_dataset(write(tmp_path, NAMES), intrinsics=(50.0, 50.0, 80.0, 30.0))
+    told = open_dataset(write(tmp_path, NAMES), intrinsics=(50.0, 50.0, 80.0, 30.0), color=False)
+    assert told.read(1).color is None
     assert told.camera == PinholeCamera(160, 60, 50.0, 50.0, 80.0, 30.0)
     assert f"{SIGMA_D_PX / (BASELINE * 50.0):.3e}" in told.notes[0]
 
@@ -327,6 +328,8 @@ def test_a_file_that_is_no_description(tmp_path: Path, text: str) -> None:
 
 def test_poses_that_do_not_fit(tmp_path: Path) -> None:
     path = write(tmp_path, NAMES)
+    write_rows(tmp_path / "poses.txt", [pose(0)])
+    refused(path, "poses.txt: contains 1 poses for 3 stereo pairs")
     write_stamped(tmp_path / "poses.txt", [0.0], [pose(0)])
     refused(path, "poses.txt: has stamps, but the images have none")
     refused(path, "depth_scale", depth_scale=1000.0)
