@@ -67,7 +67,7 @@ def write_page(
                 add_cells(server.scene, layer.store, look, m.voxel_size, prior + min_evidence)
             low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))
             eye.map_grew(low, high)
-        write_text(path, standalone_page(server.get_scene_serializer(), dark=False))
+        write_text(path, standalone_page(server.get_scene_serializer()))
     finally:
         server.stop()
 

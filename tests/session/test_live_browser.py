@@ -168,12 +168,16 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
     half = page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
     page.screenshot("cut_z")
-    page.slide("Cut at", 0.3)
+    page.slide("Cut at (m)", 0.7)
     lower = page.until(lambda seen: seen.agrees and 0 < seen.voxels < half.voxels, "fewer still")
     page.select("Cut axis", "x")
     page.until(lambda seen: seen.agrees and seen.voxels not in (0, lower.voxels), "another cut")
     page.screenshot("cut_x")
-    page.slide("Cut at", 0.5)
+    seen = page.look()
+    page.tick("Flip cut")
+    page.until(lambda other: other.agrees and other.voxels + seen.voxels > before.voxels, "the other side")
+    page.screenshot("cut_flipped")
+    page.tick("Flip cut", on=False)
     page.select("Cut axis", "none")
     after = page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
     assert "/cut" not in after.nodes
@@ -204,7 +208,7 @@ def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
 
 def test_dark_and_light(page: LivePage) -> None:
     for dark in (True, False):
-        page.tick("Dark", on=dark)
+        page.page.emulate_media(color_scheme="dark" if dark else "light")
         scheme = "dark" if dark else "light"
         page.page.wait_for_selector(f'html[data-mantine-color-scheme="{scheme}"]', state="attached")
         corner = cv2.imread(str(page.screenshot(scheme)))[-40:, :40]
@@ -338,10 +342,15 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
 ) -> None:
     before = page.look()
     with LivePage(browser, program.address, width=400, height=700) as narrow:
+        assert not narrow.input("Show").is_visible()  # the panel is folded at first
+        narrow.until(lambda seen: seen.voxels == before.voxels, "the voxels")
+        places = np.array(narrow.places("/voxels/", "points"))[:, :2]
+        assert ((places > 0) & (places < (400, 700))).all()
+        narrow.page.get_by_text("taichi_mrf", exact=True).click()
         assert narrow.until_settled().voxels == before.voxels
         narrow.screenshot("narrow")
         assert narrow.page.evaluate("() => document.documentElement.scrollWidth") <= 400
-        for label in ("Threshold", "Color by", "Cut at"):
+        for label in ("Threshold", "Color by", "Size"):
             widget = narrow.input(label)
             widget.scroll_into_view_if_needed()
             box = widget.bounding_box()

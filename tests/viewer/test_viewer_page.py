@@ -298,8 +298,8 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
     client, held, made = handled.client_id(), threading.Event(), []
 
     class Scene:
-        def as_html(self, dark: bool) -> str:
-            made.append(dark)
+        def as_html(self) -> str:
+            made.append(1)
             held.wait()
             return '<head><script>e.type="module"</script></head>'
 

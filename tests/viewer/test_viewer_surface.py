@@ -211,8 +211,8 @@ def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
                         np.ones((1, 512), np.uint8), np.zeros((0, 3), np.int32)))  # fmt: skip
     drawn.take(patch())
     drawn.take(VIEW)
-    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=1.0)
-    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=0.6)
+    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=9.0)
+    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=3.85)
 
 
 def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import viser
 import viser.transforms as vtf
+from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
@@ -17,21 +18,25 @@ from taichi_mrf.viewer.live.panel import (
     SWITCHES,
     Clicked,
     Dragged,
+    Framed,
     Panel,
-    Point,
     VoxelAnswer,
     beside,
     facts_of,
+    facts_of_many,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import in_markdown
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
+
+MOST_ASKED = 32
+"""Of as many voxels in a rectangle keyframes are asked at most."""
 
 _PLAIN = ViewOptions(show="voxels")
 """Options that the mapping process serves unless it is asked for more."""
@@ -45,7 +50,8 @@ class Page(BasePage[Panel]):
         inbox = Inbox()
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
         self._hello: m.Hello
-        self._eye: Point = (0.0, 0.0, 0.0)  # from where the voxel of the answer was clicked
+        self._question: m.RayThrough | m.WhoSays  # what the answer beside the click is about
+        self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
         self._edits: list[tuple[Edit, Edit]] = []
@@ -66,6 +72,7 @@ class Page(BasePage[Panel]):
             m.TimeSpan: self.panel.time.show_span,
             m.SceneChanges: self.panel.time.show_changes,
             Clicked: self._clicked,
+            Framed: self._framed,
             Dragged: self._dragged,
         }
         self.actions |= {
@@ -99,12 +106,15 @@ class Page(BasePage[Panel]):
             "Voxels": lambda client: ask(m.Save("ply", client)),
             "Mesh": lambda client: ask(m.Save("mesh", client)),
             "Picture": self.downloads.picture,
-            "Page": lambda client: self.downloads.page(client, self.options.dark),
+            "Page": self.downloads.page,
             "Recording": self._record,
             "Close": lambda client: self.answer.clear(),
             **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
         server.scene.on_click()(lambda event: inbox.put(_click_of(event)))
+        server.scene.on_rect_select(modifier="shift")(
+            lambda event: inbox.put(Framed(event.client_id, np.array([event.screen_min, event.screen_max])))
+        )
 
     def options_changed(self, before: ViewOptions) -> None:
         """Tell the mapping process which extras are shown, and follow the camera if asked."""
@@ -333,17 +343,37 @@ class Page(BasePage[Panel]):
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
             x, y, z = voxel[0].tolist()
-            self.answer.move((x, y, z), click.place)
-            self.answer.show(facts_of(voxel[0], self.map.store, self._hello))
-            self._eye = click.origin
-            self.ask(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen))
+            store = self.map.store
+            self._facts = lambda: facts_of(voxel[0], store, self._hello)
+            self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
+
+    def _framed(self, drawn: Framed) -> None:
+        """Say how large what is seen in a rectangle is, and ask which keyframes say that it is there."""
+        handle = self.server.get_clients().get(drawn.client)
+        if handle is None or self.map is None:
+            return
+        seen = framed(handle.camera, drawn.corners, self.map.points(), self._hello.voxel_size)
+        if len(seen):
+            middle = seen[np.argsort(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))]
+            asked = middle[:: -(-len(seen) // MOST_ASKED)]
+            self._facts = lambda: facts_of_many(seen)
+            self._answer(
+                m.WhoSays(tuple((x, y, z) for x, y, z in asked.tolist())),
+                _beside(handle.camera, drawn.corners.max(axis=0)),
+            )
+
+    def _answer(self, question: m.RayThrough | m.WhoSays, place: tuple[float, float]) -> None:
+        """Open the answer to a question at a ``place`` in the window, and ask it."""
+        self._question = question
+        self.answer.move(question.point if isinstance(question, m.RayThrough) else question.points[0], place)
+        self.answer.show(self._facts())
+        self.ask(question)
 
     def _show_votes(self, answer: m.Votes) -> None:
         if self.map is not None and answer.point == self.answer.point:
             known = self.keyframes.keyframes
             votes = [(known[id], log_odds) for id, log_odds in answer.votes if id in known]
-            facts = facts_of(np.array(answer.point), self.map.store, self._hello)
-            self.answer.show(facts, votes, answer.known)
+            self.answer.show(self._facts(), votes, answer.known)
 
     def _switch_off(self, place: int, client: int) -> None:
         """Switch off the keyframe at a place of the answer's list, and show what the others say of the
@@ -351,7 +381,7 @@ class Page(BasePage[Panel]):
         listed = self.answer.said_by[place : place + 1]
         if listed and self.keyframes.keyframes[listed[0]].state == "on" and self.answer.point is not None:
             self._make(m.Switch(listed[0], False))
-            self.ask(m.RayThrough(self.answer.point, self._eye, self.keyframes.chosen))
+            self.ask(self._question)
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
         """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
@@ -362,6 +392,11 @@ class Page(BasePage[Panel]):
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:
-    (x, y), camera = event.screen_pos, event.client.camera
-    place = beside(x * camera.image_width, y * camera.image_height, camera.image_width, camera.image_height)
+    place = _beside(event.client.camera, np.array(event.screen_pos))
     return Clicked(event.ray_origin, event.ray_direction, place)
+
+
+def _beside(camera: viser.CameraHandle, share: NDArray[np.float64]) -> tuple[float, float]:
+    """Where a panel lies beside a place (2,), in shares of the window."""
+    width, height = camera.image_width, camera.image_height
+    return beside(float(share[0]) * width, float(share[1]) * height, width, height)

@@ -41,6 +41,14 @@ class Clicked(Event):
 
 
 @dataclass(frozen=True)
+class Framed(Event):
+    """A client has drawn a rectangle over the scene, with these ``corners`` (2, 2), shares of the window."""
+
+    client: int
+    corners: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Dragged(Event):
     """The gizmo was grabbed, or let go where it is now."""
 
@@ -74,7 +82,8 @@ NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
-    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "show_baseline",
+    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks",
+    "show_baseline",
 )  # fmt: skip
 TIME_STEP_S = 0.1
 
@@ -94,7 +103,8 @@ class Panel(BasePanel):
         self.add_buttons(
             "View",
             ("Top", "Front", "Side", "Fit"),
-            "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.",
+            "Keys 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
+            "with Shift held, to see which keyframes say what is there, and how large it is.",
         )
         self.view_options.add("follow")
         for label, command in COMMANDS.items():
@@ -110,7 +120,7 @@ class Panel(BasePanel):
             self.view_options.add(*_MAP_OPTIONS)
             with gui.add_folder("Space"):
                 self.view_options.add("ground", "axes")
-            self.view_options.add("pictures", "dark")
+            self.view_options.add("pictures")
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
         with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
@@ -389,7 +399,7 @@ class VoxelAnswer:
         self._panel = panel.gui.add_panel(visible=False)
         with self._panel.add_tab("Voxel", viser.Icon.CUBE):
             self._text = panel.gui.add_html("")
-            hint = "Remove this keyframe from the map."
+            hint = "Remove this keyframe from the map; Undo brings it back."
             self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
             panel.add_button("Close", color="gray")
         self.said_by: list[int] = []
@@ -401,6 +411,7 @@ class VoxelAnswer:
         before, self.point = self.point, point
         self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
         self._panel.visible = True
+        self._panel.expand()
         if before is not None and before != point:
             ends = np.array([before, point])
             self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
@@ -415,11 +426,12 @@ class VoxelAnswer:
     def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
         """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest
         first, each with a button; ``known`` is None before they have been asked."""
-        self._scene.add_label("/answer", facts["state"], position=np.array(self.point))
+        label = facts.get("state") or f"{facts['voxels']} voxels"
+        self._scene.add_label("/answer", label, position=np.array(self.point))
         text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
         if known:
-            seen_by = f"{len(votes)} keyframes see it" if len(votes) > 1 else "one keyframe sees it"
-            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees it"
+            seen_by = f"{len(votes)} keyframes see this" if len(votes) > 1 else "one keyframe sees this"
+            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees this"
         self._text.content = (
             f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
         )
@@ -447,6 +459,16 @@ def in_words(log_odds: float) -> str:
     """What a keyframe alone would say of a voxel."""
     sure = 1 / (1 + np.exp(-abs(log_odds)))
     return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
+
+
+def facts_of_many(points: NDArray[np.float64]) -> dict[str, str]:
+    """Number, middle and size of some voxels with centres (n, 3) in metres."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return {
+        "voxels": f"{len(points):,}",
+        "middle x, y, z (m)": ", ".join(f"{value:.2f}" for value in (low + high) / 2),
+        "size x, y, z (m)": " x ".join(f"{value:.2f}" for value in high - low),
+    }
 
 
 def facts_of(point: NDArray[np.float64], store: VoxelStore, hello: m.Hello) -> dict[str, str]:

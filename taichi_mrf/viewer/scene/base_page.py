@@ -69,9 +69,10 @@ class BasePage(Generic[P]):
             Joined: lambda joined: self.viewpoint.joined(joined.client),
         }
         """Handler of each kind of update and event; other kinds are ignored."""
-        self._show_theme()
+        server.gui.configure_theme(control_width=self.control_width, show_share_button=False, show_logo=False)
         server.scene.set_background_image(_backdrop(), format="png")
         server.scene.configure_default_lights(cast_shadow=False)
+        panel.show_cut(None)
         server.on_client_connect(lambda client: inbox.put(Joined(client.client_id)))
 
     def run(self) -> None:
@@ -119,20 +120,19 @@ class BasePage(Generic[P]):
         before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
-        if self.options.dark != before.dark:
-            self._show_theme()
+        if self.options.cut_axis != before.cut_axis:
+            self._offer_cuts(in_middle=True)
+            self.options = self.panel.view_options.value()
         self.options_changed(before)
         self.keyframes.show_pictures(self.options.pictures)
         if self.map is not None:
             self.map.look_changed()
 
-    def _show_theme(self) -> None:
-        self.server.gui.configure_theme(
-            control_width=self.control_width,
-            dark_mode=self.options.dark,
-            show_share_button=False,
-            show_logo=False,
-        )
+    def _offer_cuts(self, in_middle: bool = False) -> None:
+        """Let the cut go from one end of the map to the other."""
+        ends_m, axis = None if self.map is None else self.map.layers["map"].ends_m(), self.options.cut_axis
+        along = None if ends_m is None or axis == "none" else ends_m[:, "xyz".index(axis)]
+        self.panel.show_cut(along, in_middle)
 
     def _flush(self) -> None:
         """Draw what has changed of the map, if it is time."""
@@ -142,6 +142,7 @@ class BasePage(Generic[P]):
         if not self.map.flush(self.options, self.viewpoint.up, crossed, self._announce):
             return
         self.show_counts()
+        self._offer_cuts()
         with_baseline = bool(self.map.layers["baseline"].store.chunks)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline

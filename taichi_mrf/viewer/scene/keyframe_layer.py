@@ -29,6 +29,9 @@ LEAST_TO_MERGE = 4096
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
+_DEEP = 4.0
+"""Depth of the voxels that count as seen in one direction, in voxels: a slanted surface has some."""
+
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
@@ -342,6 +345,27 @@ def first_voxel(
         return None
     first = met[np.argmin(range_m[met])]
     return centres[first], float(range_m[first])
+
+
+def framed(
+    camera: viser.CameraHandle, corners: NDArray[np.float64], points: NDArray[np.float64], side_m: float
+) -> NDArray[np.float64]:
+    """Of some points (n, 3) in metres, world, those that a browser's camera sees in a rectangle with these
+    corners (2, 2), shares of the window: of voxels of this side that others hide, none."""
+    local = (points - camera.position) @ np.asarray(vtf.SO3(camera.wxyz).as_matrix())
+    tall = np.tan(0.5 * camera.fov)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = local[:, :2] / local[:, 2:]
+    shares = 0.5 + 0.5 * slopes / (tall * camera.aspect, tall)
+    inside = (local[:, 2] > 0) & ((shares >= corners[0]) & (shares <= corners[1])).all(axis=1)
+    points, slopes, range_m = points[inside], slopes[inside], local[inside, 2]
+    if not len(points):
+        return points
+    cells = np.floor(slopes * range_m.min() / (2.0 * side_m))
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    nearest_m = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest_m, cell.reshape(-1), range_m)
+    return points[range_m <= nearest_m[cell.reshape(-1)] + _DEEP * side_m]
 
 
 def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:

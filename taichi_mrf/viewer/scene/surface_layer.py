@@ -149,8 +149,8 @@ class SurfaceLayer:
         """The triangles that are not cut away."""
         if cut is None:
             return patch.triangles
-        before = patch.vertices_m[:, cut.axis] <= (cut.voxel + 1) * self._voxel_size
-        return patch.triangles[before[patch.triangles].all(axis=1)]
+        kept = cut.keeps(patch.vertices_m[:, cut.axis] / self._voxel_size)
+        return patch.triangles[kept[patch.triangles].all(axis=1)]
 
     def _colors(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> NDArray[np.uint8]:
         view = self._view

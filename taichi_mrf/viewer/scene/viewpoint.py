@@ -1,6 +1,6 @@
 """The viewpoint of the browsers: a view of the whole map at first, and a view that follows the camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -41,12 +41,23 @@ _WIDE_RAD = np.deg2rad(75.0)
 
 @dataclass(frozen=True)
 class _View:
-    """From where a browser looks: metres, world."""
+    """From where a browser looks: metres, world. A view of the whole map is moved ``aside_m`` beside the
+    panel in a wide window, and back in a narrow one; others suit every window."""
 
     eye_m: NDArray[np.float64]
     target_m: NDArray[np.float64]
     up: NDArray[np.float64]
     fov_rad: float = _WIDE_RAD
+    aside_m: NDArray[np.float64] | None = None
+
+    def within(self, aspect: float) -> "_View":
+        """The view in a window of this width over height."""
+        if self.aside_m is None:
+            return self
+        if aspect > 1:
+            return replace(self, eye_m=self.eye_m + self.aside_m, target_m=self.target_m + self.aside_m)
+        back = max(1.0, _ASPECT * (1 - _PANEL_OF_WINDOW) / aspect)
+        return replace(self, eye_m=self.target_m + back * (self.eye_m - self.target_m))
 
 
 class ViewpointController:
@@ -129,8 +140,8 @@ class ViewpointController:
         along = view.target_m - view.eye_m
         width_m = 2.0 * _BACK * float(np.linalg.norm(along)) * np.tan(0.5 * view.fov_rad) * _ASPECT
         right = np.cross(along, view.up)
-        target = view.target_m + _ASIDE * width_m * right / np.linalg.norm(right)
-        self._begin_with(_View(target - _BACK * along, target, view.up, view.fov_rad))
+        aside = _ASIDE * width_m * _unit(right)
+        self._begin_with(_View(view.target_m - _BACK * along, view.target_m, view.up, view.fov_rad, aside))
 
     def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Look at the whole box from ``low`` to ``high`` (metres, world): browsers that connect later, and
@@ -148,9 +159,8 @@ class ViewpointController:
         camera = centre if self._camera is None else self._camera[:3, 3]
         aside[short], aside[long] = np.sign(camera[short] - centre[short]) or 1.0, 0.35
         right = np.cross(up, aside) / np.linalg.norm(aside)
-        target = centre + _PANEL_SHARE * size * right
-        eye = target + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
-        self._begin_with(_View(eye, target, up))
+        eye = centre + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
+        self._begin_with(_View(eye, centre, up, aside_m=_PANEL_SHARE * size * right))
 
     def _begin_with(self, view: _View) -> None:
         """Show this view to browsers that connect later, and to those whose user has not moved theirs."""
@@ -178,6 +188,7 @@ class ViewpointController:
         slowly takes its first view after it was pointed elsewhere."""
         view = self._shared_view()
         if view is not None:
+            view = view.within(_ASPECT)
             start = self._server.initial_camera
             start.position, start.look_at, start.up, start.fov = (
                 view.eye_m, view.target_m, view.up, view.fov_rad,
@@ -192,6 +203,7 @@ class ViewpointController:
         return _View(position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward, up)
 
     def _point(self, client: viser.ClientHandle, view: _View) -> None:
+        view = view.within(client.camera.aspect)
         with client.atomic():
             client.camera.up_direction = view.up
             client.camera.position = view.eye_m

@@ -80,8 +80,9 @@ class OptionWidgets(Generic[T]):
 
 
 def label_of(name: str) -> str:
-    """The label of a field."""
-    return name.replace("_", " ").capitalize()
+    """The label of a field; one in metres says so at its end."""
+    words = name.removesuffix("_m").replace("_", " ").capitalize()
+    return f"{words} (m)" if name.endswith("_m") else words
 
 
 def add_widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:

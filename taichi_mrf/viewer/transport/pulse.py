@@ -1,10 +1,13 @@
-"""Check that the page still has a server and a mapping process behind it: the server's answer, and a script
-in the page that asks.
+"""The page's own script, and the server's answer to it: whether the page still has a server and a mapping
+process behind it.
 
 viser's client notices only that its socket is closed, and a process that is stopped closes nothing. It keeps
 the last words of the panel, which may be "done". So the script asks each second, says in words what does not
 answer, and hides what the panel says is being done. It lets the client connect again also without the focus,
 and reloads the page of a server that answers while the socket stays closed.
+
+The script also gives the page the colours that the system prefers, until a user chooses others in viser's
+settings, which the browser keeps; and on a phone the panel is as wide as the window and folded at first.
 """
 
 import http
@@ -26,20 +29,46 @@ ACTIVITY = "taichi-mrf-activity"
 
 SCRIPT = (
     """(() => {
-const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20;
+const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20, KEPT = "taichi-mrf-scheme";
 document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
-let timer, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
+let timer, socket, theme, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
+const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
+const preferred = () => system.matches ? "dark" : "light";
 window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
   constructor(...given) {
     super(...given);
+    socket = this;
     this.addEventListener("message", ({data}) => {
+      for (const message of data?.messages ?? []) {
+        if (message.type !== "ThemeConfigurationMessage") continue;
+        theme = message;
+        theme.dark_mode = (localStorage.getItem(KEPT) ?? preferred()) === "dark";
+      }
       if (data?.type === "connected") [wasOpen, closed] = [true, false];
       if (data?.type === "closed") [closed, hasClosed] = [true, true];
     });
   }
 };
+system.addEventListener("change", () => {
+  const data = {type: "message_batch", messages: [theme]};
+  if (theme) socket.dispatchEvent(new MessageEvent("message", {data}));
+});
+new MutationObserver(() => {
+  const scheme = root.dataset.mantineColorScheme, chosen = localStorage.getItem(KEPT) ?? preferred();
+  if (!theme || !scheme || scheme === chosen) return;
+  scheme === preferred() ? localStorage.removeItem(KEPT) : localStorage.setItem(KEPT, scheme);
+}).observe(root, {attributeFilter: ["data-mantine-color-scheme"]});
+const fold = () => {
+  const head = document.querySelector('[style*="min-height: 3.5em"] [style*="cursor: pointer"]');
+  head ? head.click() : requestAnimationFrame(fold);
+};
+if (matchMedia("(max-width: 36em)").matches) fold();  // the width from which on viser has a floating panel
 const style = document.createElement("style");
 style.textContent = `
+  @media (max-width: 36em) {
+    [style*="width: 20em"] { width: 100% !important; }
+    [style*="min-height: 3.5em"] [style*="cursor: pointer"]::after { content: "▴▾"; padding-left: 1em; }
+  }
   html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }
   #cut-off { position: fixed; inset: 0 0 auto; z-index: 100000; padding: 0.6em; text-align: center;
     font: 600 16px sans-serif; color: #fff; background: #c92a2a; pointer-events: none; }
@@ -51,7 +80,7 @@ banner.setAttribute("role", "alert");
 const say = words => {
   if (words !== banner.textContent) banner.textContent = words;
   if (!banner.isConnected) document.body.append(banner);
-  document.documentElement.toggleAttribute("data-cut-off", words !== "");
+  root.toggleAttribute("data-cut-off", words !== "");
 };
 const GONE = "disconnected: reload the page if it does not come back by itself";
 const ask = async () => {

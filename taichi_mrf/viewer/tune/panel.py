@@ -38,8 +38,8 @@ SAVE_BUTTONS = {
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
-    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "ground", "axes", "pictures",
-    "dark",
+    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
+    "axes", "pictures",
 )  # fmt: skip
 
 _OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
