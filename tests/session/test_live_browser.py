@@ -121,6 +121,8 @@ def test_the_threshold_moves_the_count(page: LivePage, saved: MRFMap) -> None:
         most, fewest = (voxels_of(saved, p) for p in odds / (1 + odds))
         assert fewest <= seen.voxels <= most
         before = seen
+    page.page.get_by_text("Threshold", exact=True).hover()
+    page.until(lambda seen: "Show voxels whose probability" in page.text(), "the label's tooltip")
     page.nudge("Threshold", "ArrowRight")
     page.until(lambda seen: seen.agrees and seen.voxels < before.voxels, "fewer voxels")
     page.slide("Threshold", 0.5)
@@ -147,7 +149,7 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
     for mode, legend in [
-        ("marginal", "probability"),
+        ("probability", "probability"),
         ("uncertainty", "bits"),
         ("keyframes", "see the voxel"),
     ]:
@@ -168,7 +170,7 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
     half = page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
     page.screenshot("cut_z")
-    page.slide("Cut at (m)", 0.7)
+    page.slide("Cut at (m)", -0.7)
     lower = page.until(lambda seen: seen.agrees and 0 < seen.voxels < half.voxels, "fewer still")
     page.select("Cut axis", "x")
     page.until(lambda seen: seen.agrees and seen.voxels not in (0, lower.voxels), "another cut")
@@ -213,6 +215,13 @@ def test_dark_and_light(page: LivePage) -> None:
         page.page.wait_for_selector(f'html[data-mantine-color-scheme="{scheme}"]', state="attached")
         corner = cv2.imread(str(page.screenshot(scheme)))[-40:, :40]
         assert 60 < corner.mean() < 160  # neither white nor black things merge with the background
+    page.press("Dark or light")  # a user's choice, which the browser keeps
+    page.page.wait_for_selector('html[data-mantine-color-scheme="dark"]', state="attached")
+    page.page.reload()
+    page.page.wait_for_selector('html[data-mantine-color-scheme="dark"]', state="attached")
+    page.until_settled()
+    page.press("Dark or light")
+    page.page.wait_for_selector('html[data-mantine-color-scheme="light"]', state="attached")
 
 
 def wait_for_the_plot(page: LivePage) -> str:
@@ -263,6 +272,17 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     page.until(
         lambda seen: "/distance" not in seen.nodes and "from the last click" not in page.text(), "no answer"
     )
+    page.page.keyboard.down("Shift")
+    page.page.mouse.move(x - 40, y - 40)
+    page.page.mouse.down()
+    page.page.mouse.move(x + 40, y + 40, steps=4)
+    page.page.mouse.up()
+    page.page.keyboard.up("Shift")
+    page.until(lambda seen: votes.count() >= 1, "what keyframes say of the voxels in the rectangle")
+    sizes_m = re.search(r"size x, y, z \(m\)\s+(\S+) x (\S+) x (\S+)", page.text()).groups()
+    assert 0.1 < max(map(float, sizes_m)) < 4.0
+    page.screenshot("rectangle")
+    page.press("Close")
     text = wait_for_the_plot(page)
     assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
 

@@ -227,7 +227,7 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
     expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
-    drawn.draw(show="surface", color_by="marginal", shade=False)
+    drawn.draw(show="surface", color_by="probability", shade=False)
     assert len(np.unique(drawn.mesh()[2], axis=0)) == 1  # they are equally likely
     drawn.draw(shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Collection
 from functools import partial
+from typing import get_args
 
 import numpy as np
 import viser
 import viser.transforms as vtf
-from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
@@ -30,7 +30,7 @@ from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
-from taichi_mrf.viewer.scene.widgets import in_markdown
+from taichi_mrf.viewer.scene.widgets import change, in_markdown
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
@@ -64,6 +64,7 @@ class Page(BasePage[Panel]):
             m.SurfacePatch: lambda patch: None if self.map is None else self.map.surface.take(patch),
             m.SurfaceView: self._take_surface_view,
             m.KeyframeInfo: self._take_keyframe,
+            m.File: self._take_file,
             m.CurrentCamera: self._take_camera,
             m.Status: self._take_status,
             m.RayAnswer: self._show_ray,
@@ -80,14 +81,11 @@ class Page(BasePage[Panel]):
             "Pause": lambda client: ask(m.Pause(True)),
             "Step": lambda client: ask(m.Step()),
             "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
-            "Top": partial(self._look_from, "top"),
-            "Front": partial(self._look_from, "front"),
-            "Side": partial(self._look_from, "side"),
-            "Fit": partial(self._look_from, "here"),
+            **{side.capitalize(): partial(self._look_from, side) for side in get_args(Side)},
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
             "Delete the map and start again": self.panel.agree,
-            "Undo": lambda client: self._undo(),
+            "Undo": lambda client: self._redo(back=True),
             "Redo": lambda client: self._redo(),
             "Keep the map": self.panel.close_question,
             "Leave it as it is": self.panel.close_question,
@@ -98,16 +96,16 @@ class Page(BasePage[Panel]):
             "Move": lambda client: self._toggle_gizmo(),
             "Put back": lambda client: self._edit(self._move_home),
             "Position (m)": lambda client: self._edit(self._move_as_typed),
-            "Show the ray": lambda client: self._edit(self._ray_of_pixel),
+            "Show the ray": lambda client: self._edit(lambda k: m.PixelRay(k.id, *self.panel.pixel.value)),
             "Show images": lambda client: self._watch_images(),
             "View": lambda client: self._watch_images(),
             "Time (s)": lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
-            "Map": lambda client: ask(m.Save("map", client)),
-            "Voxels": lambda client: ask(m.Save("ply", client)),
-            "Mesh": lambda client: ask(m.Save("mesh", client)),
-            "Picture": self.downloads.picture,
-            "Page": self.downloads.page,
-            "Recording": self._record,
+            "Map (.npz)": lambda client: ask(m.Save("map", client)),
+            "Voxels (.ply)": lambda client: ask(m.Save("ply", client)),
+            "Mesh (.ply)": lambda client: ask(m.Save("mesh", client)),
+            "Picture (.png)": self.downloads.picture,
+            "Page (.html)": self.downloads.page,
+            "Recording (.viser)": self._record,
             "Close": lambda client: self.answer.clear(),
             **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
@@ -136,6 +134,7 @@ class Page(BasePage[Panel]):
         self._hello, self._in_photo = hello, False
         self.answer.clear()
         self._forget_edits(self.keyframes.keyframes)
+        change(self.panel.unsaved, visible=False)
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
@@ -173,9 +172,16 @@ class Page(BasePage[Panel]):
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
+        if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
+            change(self.panel.unsaved, visible=True)
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)
+
+    def _take_file(self, file: m.File) -> None:
+        self.downloads.send(file.client, file.name, file.content)
+        if file.name.endswith(".npz"):
+            change(self.panel.unsaved, visible=False)
 
     def _take_camera(self, camera: m.CurrentCamera) -> None:
         self.keyframes.show_camera(camera)
@@ -241,17 +247,13 @@ class Page(BasePage[Panel]):
         self._show_history()
         self.ask(edit)
 
-    def _undo(self) -> None:
-        if self._done > 0:
-            self._done -= 1
+    def _redo(self, back: bool = False) -> None:
+        """Make the next edit again, or take the last one ``back``."""
+        place = self._done - back
+        if 0 <= place < len(self._edits):
+            self._done = place + (not back)
             self._show_history()
-            self.ask(self._edits[self._done][0])
-
-    def _redo(self) -> None:
-        if self._done < len(self._edits):
-            self._done += 1
-            self._show_history()
-            self.ask(self._edits[self._done - 1][1])
+            self.ask(self._edits[place][0 if back else 1])
 
     def _forget_edits(self, keyframes: Collection[int]) -> None:
         """Edits of these keyframes can no longer be taken back."""
@@ -265,15 +267,12 @@ class Page(BasePage[Panel]):
 
     def _changeable(self) -> m.KeyframeInfo | None:
         """The chosen keyframe; None, with a notice that says why, if it cannot be changed."""
-        if self.keyframes.chosen is None:
-            self.notify(m.Notice("There is no keyframe yet.", "warning"))
-            return None
-        info = self.keyframes.keyframes[self.keyframes.chosen]
-        if info.state == "frozen":
-            text = f"Keyframe {info.id} ({info.name}) is frozen: it cannot be changed."
-            self.notify(m.Notice(text, "warning"))
-            return None
-        return info
+        info = None if self.keyframes.chosen is None else self.keyframes.keyframes[self.keyframes.chosen]
+        if info is not None and info.state != "frozen":
+            return info
+        frozen = info and f"Keyframe {info.id} ({info.name}) is frozen: it cannot be changed."
+        self.notify(m.Notice(frozen or "There is no keyframe yet.", "warning"))
+        return None
 
     def _move_home(self, keyframe: m.KeyframeInfo) -> m.Request:
         return m.Move(keyframe.id, self.keyframes.roster.recorded[keyframe.id])
@@ -284,10 +283,6 @@ class Page(BasePage[Panel]):
         typed = np.array(self.panel.position.value)
         T[:3, 3] = np.where(np.abs(typed - T[:3, 3]) > 0.51 * POSITION_STEP_M, typed, T[:3, 3])
         return m.Move(keyframe.id, T)
-
-    def _ray_of_pixel(self, keyframe: m.KeyframeInfo) -> m.Request:
-        u, v = self.panel.pixel.value
-        return m.PixelRay(keyframe.id, u, v)
 
     def _toggle_gizmo(self) -> None:
         if self.keyframes.gizmo is not None:
@@ -318,7 +313,7 @@ class Page(BasePage[Panel]):
 
     def _watch_images(self) -> None:
         if not self.panel.images.value:
-            self.panel.hide_images()
+            self.panel.show_images(None)
         self._ask_for_extras()
 
     def _ask_for_extras(self) -> None:
@@ -343,8 +338,7 @@ class Page(BasePage[Panel]):
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
             x, y, z = voxel[0].tolist()
-            store = self.map.store
-            self._facts = lambda: facts_of(voxel[0], store, self._hello)
+            self._facts = partial(facts_of, voxel[0], self.map.store, self._hello)
             self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
 
     def _framed(self, drawn: Framed) -> None:
@@ -356,10 +350,10 @@ class Page(BasePage[Panel]):
         if len(seen):
             middle = seen[np.argsort(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))]
             asked = middle[:: -(-len(seen) // MOST_ASKED)]
-            self._facts = lambda: facts_of_many(seen)
+            self._facts = partial(facts_of_many, seen)
             self._answer(
                 m.WhoSays(tuple((x, y, z) for x, y, z in asked.tolist())),
-                _beside(handle.camera, drawn.corners.max(axis=0)),
+                beside(handle.camera, drawn.corners.max(axis=0)),
             )
 
     def _answer(self, question: m.RayThrough | m.WhoSays, place: tuple[float, float]) -> None:
@@ -392,11 +386,5 @@ class Page(BasePage[Panel]):
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:
-    place = _beside(event.client.camera, np.array(event.screen_pos))
+    place = beside(event.client.camera, event.screen_pos)
     return Clicked(event.ray_origin, event.ray_direction, place)
-
-
-def _beside(camera: viser.CameraHandle, share: NDArray[np.float64]) -> tuple[float, float]:
-    """Where a panel lies beside a place (2,), in shares of the window."""
-    width, height = camera.image_width, camera.image_height
-    return beside(float(share[0]) * width, float(share[1]) * height, width, height)

@@ -59,7 +59,7 @@ class BasePage(Generic[P]):
         self.map: MapScene | None = None
         self._scale: Scale | None = None
         self._with_baseline = False
-        self.actions: dict[str, Callable[[int], None]] = {}
+        self.actions: dict[str, Callable[[int], None]] = {BasePanel.DARK_OR_LIGHT[0]: self._turn_colors}
         """Function of each action, given the client that asked for it."""
         self.handlers: dict[type, Callable[[Any], None]] = {
             m.Notice: self.notify,
@@ -69,7 +69,8 @@ class BasePage(Generic[P]):
             Joined: lambda joined: self.viewpoint.joined(joined.client),
         }
         """Handler of each kind of update and event; other kinds are ignored."""
-        server.gui.configure_theme(control_width=self.control_width, show_share_button=False, show_logo=False)
+        self._theme: Any = {"show_logo": False, "show_share_button": False}
+        server.gui.configure_theme(control_width=self.control_width, **self._theme)
         server.scene.set_background_image(_backdrop(), format="png")
         server.scene.configure_default_lights(cast_shadow=False)
         panel.show_cut(None)
@@ -127,6 +128,12 @@ class BasePage(Generic[P]):
         self.keyframes.show_pictures(self.options.pictures)
         if self.map is not None:
             self.map.look_changed()
+
+    def _turn_colors(self, client: int) -> None:
+        """The page's script takes dark colours as its user's wish for the others than now."""
+        handle = self.server.get_clients().get(client)
+        if handle is not None:
+            handle.gui.configure_theme(control_width=self.control_width, dark_mode=True, **self._theme)
 
     def _offer_cuts(self, in_middle: bool = False) -> None:
         """Let the cut go from one end of the map to the other."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import Notice, Update
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, change, in_html
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
 
@@ -86,6 +86,8 @@ _LONGEST_POP_UP = 500
 class BasePanel:
     """Adds widgets to the current container of the GUI; each use of them calls ``tell`` with an event."""
 
+    DARK_OR_LIGHT = "Dark or light", "The panel's colours in this browser; at first as its system has them."
+
     def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
         self.gui, self._tell = gui, tell
@@ -149,14 +151,11 @@ class BasePanel:
         """Offer cuts between these coordinates (2,), and cut in the middle of them if asked; None: no cut."""
         slider, flip = (self.view_options.handles[name] for name in ("cut_at_m", "flip_cut"))
         for handle in (slider, flip):
-            if handle.visible != (ends_m is not None):
-                handle.visible = ends_m is not None
+            change(handle, visible=ends_m is not None)
         if ends_m is not None:
             low, high = np.round(ends_m, 2).tolist()
             middle = round((low + high) / 2, 2) if in_middle else min(max(slider.value, low), high)
-            for name, value in (("min", low), ("max", high), ("value", middle)):
-                if getattr(slider, name) != value:
-                    setattr(slider, name, value)
+            change(slider, min=low, max=high, value=middle)
 
     def show_legend(self, legend_html: str) -> None:
         """Show the scale of the colours."""

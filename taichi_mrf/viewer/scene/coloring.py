@@ -18,8 +18,8 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
-ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
-OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")
+ColorBy = Literal["probability", "height", "uncertainty", "keyframes", "photo"]
+OF_BELIEFS: tuple[ColorBy, ...] = ("probability", "height", "uncertainty")
 """Choices of what the colour shows of every map."""
 Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
@@ -80,7 +80,7 @@ class ViewOptions:
 
 
 _MAPS: dict[ColorBy, str] = {
-    "marginal": "viridis",
+    "probability": "viridis",
     "height": "Spectral_r",
     "uncertainty": "magma",
     "keyframes": "plasma",

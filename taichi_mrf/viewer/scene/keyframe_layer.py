@@ -29,9 +29,6 @@ LEAST_TO_MERGE = 4096
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
-_DEEP = 4.0
-"""Depth of the voxels that count as seen in one direction, in voxels: a slanted surface has some."""
-
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
@@ -351,7 +348,8 @@ def framed(
     camera: viser.CameraHandle, corners: NDArray[np.float64], points: NDArray[np.float64], side_m: float
 ) -> NDArray[np.float64]:
     """Of some points (n, 3) in metres, world, those that a browser's camera sees in a rectangle with these
-    corners (2, 2), shares of the window: of voxels of this side that others hide, none."""
+    corners (2, 2), shares of the window. Of voxels of this side, those count that others do not hide; a
+    slanted surface is some of them deep."""
     local = (points - camera.position) @ np.asarray(vtf.SO3(camera.wxyz).as_matrix())
     tall = np.tan(0.5 * camera.fov)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -365,7 +363,7 @@ def framed(
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     nearest_m = np.full(cell.max() + 1, np.inf)
     np.minimum.at(nearest_m, cell.reshape(-1), range_m)
-    return points[range_m <= nearest_m[cell.reshape(-1)] + _DEEP * side_m]
+    return points[range_m <= nearest_m[cell.reshape(-1)] + 4.0 * side_m]
 
 
 def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:

@@ -45,8 +45,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across ``axis``: the voxels whose coordinate there is more than ``voxel`` are hidden; those
-    below it if it is ``flipped``."""
+    """A plane across ``axis``: voxels beyond ``voxel`` there are hidden; if ``flipped``, those before it."""
 
     axis: int
     voxel: int

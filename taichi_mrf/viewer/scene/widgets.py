@@ -68,8 +68,7 @@ class OptionWidgets(Generic[T]):
 
     def offer(self, name: str, choices: Sequence[str]) -> None:
         """Let a dropdown offer these choices only."""
-        if tuple(self.handles[name].options) != tuple(choices):
-            self.handles[name].options = tuple(choices)
+        change(self.handles[name], options=tuple(choices))
 
     def value(self) -> T:
         """The options with the values of the widgets."""
@@ -77,6 +76,13 @@ class OptionWidgets(Generic[T]):
         options: Any = self._options
         result: T = dataclasses.replace(options, **values)
         return result
+
+
+def change(handle: Any, **values: Any) -> None:
+    """Set those properties of a widget or a scene node that differ: browsers are told of each that is set."""
+    for name, value in values.items():
+        if getattr(handle, name) != value:
+            setattr(handle, name, value)
 
 
 def label_of(name: str) -> str:
