@@ -17,8 +17,8 @@ from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
 from taichi_mrf.inference.surface_rays import SCALE, AddDistances, Band, DistanceSums
 from taichi_mrf.inference.workers import workers_without_trace
+from taichi_mrf.kernels.resident import on_host, unfilled
 from taichi_mrf.system import runtime
-from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
@@ -61,12 +61,12 @@ class SurfaceRays:
         bricks = bricks[first]
         bricks = bricks[np.argsort(grid_keys(bricks // CHUNK), kind="stable")]
         check_memory(12.0 * VOXELS * len(bricks), f"the surface in {len(bricks)} bricks")
-        sums = np.zeros((3, len(bricks), VOXELS), np.float32)
+        order = np.argsort(grid_keys(bricks))
+        place, sums = np.argsort(order), np.zeros((3, len(bricks), VOXELS), np.float32)
         for begin in range(0, len(bricks), BRICKS_AT_ONCE):
             rows = slice(begin, begin + BRICKS_AT_ONCE)
-            sums[:, rows] = self._sums(bricks[rows], keyframes, bands, between)
-        order = np.argsort(grid_keys(bricks))
-        return DistanceField(bricks[order], *(each[order] for each in sums))
+            sums[:, place[rows]] = self._sums(bricks[rows], keyframes, bands, between)
+        return DistanceField(bricks[order], *sums)
 
     def bricks_in_band(self, keyframe: Keyframe) -> tuple[Window, NDArray[np.int32]]:
         """The window around the bands of a keyframe's rays, and its cells in them."""
@@ -92,7 +92,7 @@ class SurfaceRays:
         between: Callable[[], object],
     ) -> NDArray[np.float32]:
         """Weight, distance and excess, both times weight, in some bricks: (3, n, 512)."""
-        arrays = [ti.ndarray(ti.i64, len(bricks) * VOXELS) for _ in range(3)]
+        arrays = [unfilled(np.int64, len(bricks) * VOXELS) for _ in range(3)]
         for array in arrays:
             array.fill(0)
         sums = DistanceSums(*arrays)
@@ -107,8 +107,10 @@ class SurfaceRays:
             cells, slots = cells[here], rows[here].astype(np.int32)
             self._add(keyframe, visible, window, cells, slots, sums)
             between()
-        found = [array.to_numpy().reshape(-1, VOXELS) * np.float32(1.0 / SCALE) for array in arrays]
-        return np.stack([each.astype(np.float32) for each in found])
+        found = np.empty((3, len(bricks), VOXELS), np.float32)
+        for array, row in zip(arrays, found, strict=True):
+            np.multiply(on_host(array).reshape(row.shape), 1.0 / SCALE, out=row, casting="unsafe")
+        return found
 
     def _add(
         self, keyframe: Keyframe, visible: VisibleBricks, window: Window,

@@ -7,6 +7,7 @@ side from which they run counter-clockwise, by edge functions (Pineda 1988). The
 equals, the one that comes first.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,9 @@ a common face slip between its neighbours."""
 
 _NEAR_M = 0.01
 """Triangles that reach nearer than this are left out."""
+
+_PIXELS = 1 << 18
+"""Pixels whose triangles are looked at together."""
 
 _NONE = np.iinfo(np.int32).max
 """In place of the number of a shape, and of the bits of a depth, where there is none."""
@@ -225,17 +229,23 @@ def cast_triangles(
     bounds = np.clip(np.stack([first[rows], last[rows]], axis=2), 0, size[:, None] - 1)
     corners = corners[rows]
     depth_m, index = _drawn(_Triangles(corners), bounds.astype(np.int32).reshape(-1, 4), camera)
-    met = np.flatnonzero(index >= 0)
-    there = corners[index[met]]
-    there[..., :2] -= np.stack([met % camera.width, met // camera.width], axis=1)[:, None]
-    # Shares on the screen become shares in space: nearer corners count more.
-    x, y, nearness = there.transpose(2, 1, 0)
-    near = nearness * np.stack([x[a] * y[b] - x[b] * y[a] for a, b in ((1, 2), (2, 0), (0, 1))])
     shares = np.zeros((len(index), 3), np.float32)
-    shares[met] = (near / near.sum(axis=0)).T
-    index[met] = rows[index[met]]
+    for met in _in_parts(index >= 0):
+        there = corners[index[met]]
+        there[..., :2] -= np.stack([met % camera.width, met // camera.width], axis=1)[:, None]
+        # Shares on the screen become shares in space: nearer corners count more.
+        x, y, nearness = there.transpose(2, 1, 0)
+        near = nearness * np.stack([x[a] * y[b] - x[b] * y[a] for a, b in ((1, 2), (2, 0), (0, 1))])
+        shares[met] = (near / near.sum(axis=0)).T
+        index[met] = rows[index[met]]
     shape = camera.shape
     return TriangleImage(depth_m.reshape(shape), index.reshape(shape), shares.reshape(*shape, 3))
+
+
+def _in_parts(hit: NDArray[np.bool_]) -> Iterator[NDArray[np.intp]]:
+    """The pixels that are ``hit``, so many at a time that what is computed of them takes some megabytes."""
+    pixels = np.flatnonzero(hit)
+    return (pixels[begin : begin + _PIXELS] for begin in range(0, len(pixels), _PIXELS))
 
 
 def _twice_areas(corners: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -287,16 +297,18 @@ def shaded_triangles(
 ) -> NDArray[np.uint8]:
     """Colours and ``normals`` of vertices (V, 3) on their triangles (T, 3) under a far light, on a background
     (H, W, 3), RGB."""
-    hit = image.index >= 0
+    hit, picture = image.index >= 0, background.copy()
     if not hit.any():
-        return background
-    corners, shares = triangles[image.index[hit]], image.shares[hit]
-    mixed = _mixed(shares, colors[corners])
-    normal = _mixed(shares, normals[corners])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light.astype(np.float32), 0.0, 1.0)
-    picture = background.copy()
-    picture[hit] = np.rint(mixed * (light * (1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]))[:, None])
+        return picture
+    hollowness = _hollowness(image.depth_m).reshape(-1)
+    for pixels in _in_parts(hit):
+        corners, shares = triangles[image.index.flat[pixels]], image.shares.reshape(-1, 3)[pixels]
+        mixed = _mixed(shares, colors[corners])
+        normal = _mixed(shares, normals[corners])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light.astype(np.float32), 0.0, 1.0)
+        light *= 1.0 - _OCCLUSION * hollowness[pixels]
+        picture.reshape(-1, 3)[pixels] = np.rint(mixed * light[:, None])
     return picture
 
 

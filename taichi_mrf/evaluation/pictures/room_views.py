@@ -69,9 +69,9 @@ def surface_view(surface: DrawnSurface, voxel_size: float, up: NDArray[np.float6
 def smooth_borders(vertices_m: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
     """The vertices (V, 3) with those at borders moved towards their neighbours on them: where a surface ends,
     its triangles end in the steps of the voxels."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    count = len(vertices_m)
-    distinct, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    count, following = len(vertices_m), triangles[:, [1, 2, 0]]
+    edges = np.minimum(triangles, following).astype(np.int64) * count + np.maximum(triangles, following)
+    distinct, uses = np.unique(edges, return_counts=True)
     one, other = np.divmod(distinct[uses == 1], count)
     ends, beside = np.concatenate([one, other]), np.concatenate([other, one])
     neighbours = np.bincount(ends, minlength=count)
