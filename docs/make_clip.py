@@ -19,6 +19,7 @@ sys.path.insert(0, str(REPOSITORY / "tests" / "support"))  # the driver of the b
 
 from browser import LivePage, chromium  # noqa: E402
 from live_program import LiveProgram  # noqa: E402
+from page_pictures import level_cut  # noqa: E402
 
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR  # noqa: E402
 
@@ -88,11 +89,10 @@ def orbit(page: LivePage) -> list[Image.Image]:
 def cut_moving_through(page: LivePage) -> list[Image.Image]:
     """A level cut that moves down through the room and shows free space."""
     shots = []
-    page.slide("Cut at", CUT_FROM)
-    page.select("Cut axis", "z")
+    level_cut(page, CUT_FROM)
     page.page.mouse.move(0.3 * WIDTH, 0.9 * HEIGHT)
     for share in np.linspace(CUT_FROM, CUT_TO, CUT_SHOTS):
-        page.slide("Cut at", round(float(share), 3))
+        level_cut(page, float(share))
         page.until(lambda seen: seen.agrees, "the cut")
         shots.append(shot(page))
     page.select("Cut axis", "none")

@@ -34,11 +34,18 @@ def shot(page: LivePage) -> Image.Image:
     return Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
 
 
+def level_cut(page: LivePage, share: float) -> None:
+    """Cut the map at this share of its height."""
+    page.select("Cut axis", "z")
+    slider = page.input("Cut at (m)").get_by_role("slider")
+    low_m, high_m = (float(slider.get_attribute(f"aria-value{end}") or 0) for end in ("min", "max"))
+    page.slide("Cut at (m)", round(low_m + share * (high_m - low_m), 2))
+
+
 def live_cut(page: LivePage) -> Image.Image:
     """The map with a level cut at the height of the furniture."""
     page.tab("Map")
-    page.select("Cut axis", "z")
-    page.slide("Cut at", 0.3)
+    level_cut(page, 0.3)
     page.until_settled()
     picture = shot(page)
     page.select("Cut axis", "none")
@@ -54,7 +61,7 @@ def live_surface(page: LivePage) -> Image.Image:
     page.until(lambda seen: seen.settled and seen.triangles, "the surface")
     picture = shot(page).crop((0, 150, 940, 770)).resize((480, 317), Image.Resampling.LANCZOS)
     page.select("Show", "voxels")
-    page.select("Color by", "marginal")
+    page.select("Color by", "probability")
     page.until_settled()
     return picture
 
@@ -64,8 +71,7 @@ def live_lidar(page: LivePage) -> Image.Image:
     page.tab("Map")
     page.tick("Dynamic", on=False)
     page.select("Color by", "height")
-    page.select("Cut axis", "z")
-    page.slide("Cut at", 0.45)
+    level_cut(page, 0.45)
     page.until_settled()
     page.page.mouse.move(480, 430)
     for _ in range(4):
@@ -85,7 +91,7 @@ def live_keyframes(page: LivePage) -> Image.Image:
     picture = shot(page)
     page.press("Move")
     page.tab("Map")
-    page.select("Color by", "marginal")
+    page.select("Color by", "probability")
     page.until_settled()
     return picture
 
@@ -107,8 +113,7 @@ def live_images(page: LivePage) -> Image.Image:
 def live_baseline(page: LivePage) -> Image.Image:
     """The map of OctoMap's update from the same keyframes, next to this one."""
     page.tab("Map")
-    page.select("Cut axis", "z")
-    page.slide("Cut at", 0.6)
+    level_cut(page, 0.6)
     page.tick("Show baseline")
     page.until(lambda seen: seen.baseline, "the other map")
     counts: list[int] = []

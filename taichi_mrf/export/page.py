@@ -43,7 +43,7 @@ def write_page(
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
     map's), by their marginals or in the colours of ``colored``, the same map; with ``cells`` also the cells
     that stand in for voxels (queries/cells.py). Raises MapFileError, ViewerError."""
-    color_by: ColorBy = "marginal" if colored is None else "photo"
+    color_by: ColorBy = "probability" if colored is None else "photo"
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
@@ -67,7 +67,7 @@ def write_page(
                 add_cells(server.scene, layer.store, look, m.voxel_size, prior + min_evidence)
             low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))
             eye.map_grew(low, high)
-        write_text(path, standalone_page(server.get_scene_serializer(), dark=False))
+        write_text(path, standalone_page(server.get_scene_serializer()))
     finally:
         server.stop()
 

@@ -13,17 +13,17 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnRays, RayList
-from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
 from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.types import F32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.traversal import Viewpoint, clip, walk_bricks
+from taichi_mrf.voxels.traversal import FAR, Viewpoint, clip, walk_bricks
 from taichi_mrf.voxels.window import Window
 
 CROSSED, SURFACE = 1, 2
@@ -38,12 +38,11 @@ def find_footprint(
     volume: VolumeConfig,
     end_sigmas: float = END_SIGMAS,
     beyond_m: float = 0.0,
-    scouts: int = 1,
     no_returns: NoReturnRays | None = None,
 ) -> Footprint:
-    """Follow every ray of an image's list from the camera to ``end_sigmas`` beyond its measurement, and
-    ``beyond_m`` metres of axial depth more. Near its measurement each ray counts; of the way there only that
-    of every ``scouts``-th ray is followed, so that bricks may go unnoticed that few rays graze. Rays of
+    """Follow every ray of an image's list from the camera to its end, which the list's maker put
+    ``end_sigmas`` beyond its measurement, and ``beyond_m`` metres of axial depth more; in front of all
+    surfaces the rays of a group go the way that they have in common (sum_product.send_messages). Rays of
     ``no_returns`` cross bricks up to where they count and are near no surface.
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
@@ -64,9 +63,9 @@ def find_footprint(
         window.viewpoint(T_world_camera),
         _Marks(window.shape_vector, box_lower, box_upper, marks, longest),
     )
-    _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m, scouts), seen)
+    _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m), seen)
     if no_returns is not None:
-        reach = _Reach(sensor.min_depth, no_returns.reach_m, end_sigmas, 0.0, 1)
+        reach = _Reach(sensor.min_depth, no_returns.reach_m, end_sigmas, 0.0)
         _mark(no_returns.ray_list, no_returns.image.sensor, view, reach, seen)
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]
@@ -133,13 +132,10 @@ class _Reach(Bundle):
     """Metres of depth that no ray goes beyond."""
 
     end_sigmas: F32
-    """Sigmas on either side of the measurement in which a brick is near the surface."""
+    """Sigmas in front of the measurement from which on a brick is near the surface."""
 
     beyond_m: F32
     """Metres of depth that a ray goes on behind those."""
-
-    scouts: I32
-    """Every so many-th ray is followed all the way, the others near their surface only."""
 
 
 @dataclass(frozen=True)
@@ -183,21 +179,25 @@ def _mark_brick(mark: Template, marks: Template, ray: Template, brick: IVec3, t:
 @kernel
 def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: _Marks) -> None:
     """Mark the bricks that each ray crosses."""
-    for i in range(rays.number):
-        measured = rays.depth[i]
-        ray, noise, _ = listed_ray(rays, i, sensor, view)
-        last = sensor.farthest_depth(measured, noise, reach.end_sigmas) + reach.beyond_m
-        begin, end = reach.min_depth, ti.min(last, reach.max_depth)
-        clip(ray, begin, end, marks.lower, marks.upper)
-        if end > begin:
-            # A step along the ray leaves a voxel through a face, or enters a brick anew.
-            along = ti.abs(ray.direction[0]) + ti.abs(ray.direction[1]) + ti.abs(ray.direction[2])
-            faces = (end - begin) * along
-            bricks = ti.cast(faces / BRICK, ti.i32) + 4
-            steps = ti.cast(faces, ti.i32) + 4 + 2 * bricks
-            if steps > marks.longest[0]:
-                ti.atomic_max(marks.longest[0], steps)
-        mark = _Mark(sensor.nearest_depth(measured, noise, reach.end_sigmas))
-        if i % reach.scouts != 0:
-            begin = ti.max(begin, mark.surface_begin)
-        walk_bricks(ray, begin, end, marks.shape, marks.kinds, False, _mark_brick, mark, marks)
+    for group in range(rays.group_number):
+        middle, free = block_ray(rays.groups[group], sensor, view), _Mark(FAR)
+        apart = way_in_common(rays, group, middle, reach.min_depth, reach.max_depth)
+        begin, end = reach.min_depth, apart
+        clip(middle, begin, end, marks.lower, marks.upper)
+        walk_bricks(middle, begin, end, marks.shape, marks.kinds, False, _mark_brick, free, marks)
+        for i in range(rays.first[group], rays.first[group + 1]):
+            measured = rays.depth[i]
+            ray, noise, _ = listed_ray(rays, i, sensor, view)
+            last = rays.last[i] + reach.beyond_m
+            begin, end = apart, ti.min(last, reach.max_depth)
+            clip(ray, begin, end, marks.lower, marks.upper)
+            if end > reach.min_depth:
+                # A step along the ray leaves a voxel through a face, or enters a brick anew.
+                along = ti.abs(ray.direction[0]) + ti.abs(ray.direction[1]) + ti.abs(ray.direction[2])
+                faces = (end - reach.min_depth) * along
+                bricks = ti.cast(faces / BRICK, ti.i32) + 4
+                steps = ti.cast(faces, ti.i32) + 4 + 2 * bricks
+                if steps > marks.longest[0]:
+                    ti.atomic_max(marks.longest[0], steps)
+            mark = _Mark(sensor.nearest_depth(measured, noise, reach.end_sigmas))
+            walk_bricks(ray, begin, end, marks.shape, marks.kinds, False, _mark_brick, mark, marks)

@@ -42,6 +42,10 @@ AGREE_SIGMAS = 2.0
 FREE_RAYS = 1.0
 """Ways in common that meet a voxel facing the camera, at least."""
 
+CLEAR_VOXELS = 2.0
+"""Rays part this many voxels in front of the first of their surfaces: more than the longest way through one,
+so that no voxel is told by the way in common that it is free, in which a surface may be."""
+
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many."""
 
@@ -76,6 +80,17 @@ def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     return block_ray(block, sensor, view), block_noise(block, sensor), wide * high
 
 
+@ti.func
+def way_in_common(rays: Template, group: I32, middle: Template, begin: F32, max_depth: F32) -> F32:
+    """The depth up to which the rays of a group go along its ``middle`` ray from ``begin`` on. The voxel in
+    which they part is one in which none of them can have met its surface."""
+    apart = begin
+    if rays.first[group + 1] - rays.first[group] > 1:  # a ray alone goes all its way by itself
+        support = ti.min(rays.support[group], max_depth)
+        apart = ti.max(begin, support - CLEAR_VOXELS / middle.direction.norm())
+    return apart
+
+
 def rays_per_voxel(voxel_size: float, ray_density: float) -> float:
     """Rays that meet a voxel facing the camera, at least; infinite where every pixel casts one."""
     return max(1.0, ray_density * 100.0 * voxel_size) if ray_density > 0 else math.inf
@@ -90,8 +105,9 @@ def stride_metres(camera: Camera, voxel_size: float, per_voxel: float) -> float:
 class RayBundler:
     """Makes the lists of rays for one voxel size; owns the scratch, which grows to the largest image."""
 
-    def __init__(self, voxel_size: float, inference: InferenceConfig) -> None:
-        self.voxel_size, self.inference = voxel_size, inference
+    def __init__(self, voxel_size: float, inference: InferenceConfig, end_sigmas: float = END_SIGMAS) -> None:
+        """Rays end ``end_sigmas`` beyond their measurement."""
+        self.voxel_size, self.inference, self.end_sigmas = voxel_size, inference, end_sigmas
         self._nearest = ti.ndarray(ti.f32, 1)
         self._farthest = ti.ndarray(ti.f32, 1)
         self._mean = ti.ndarray(ti.f32, 1)
@@ -117,7 +133,7 @@ class RayBundler:
         rays = RayList.empty(int(counts.sum()), int(groups.sum()))
         first, first_group = (np.cumsum(each, dtype=np.int32) - each for each in (counts, groups))
         _write_down(camera.width, camera.height, pixels, first, first_group, rays, widest)
-        _find_reach(rays, image.sensor, END_SIGMAS)
+        _find_reach(rays, image.sensor, self.end_sigmas)
         return replace(rays, widest=int(widest.max()))
 
     def _reserve(self, pixels: int) -> None:

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.ray_list import block_ray, listed_ray
+from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
@@ -60,11 +60,6 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
-
-
-CLEAR_VOXELS = 2.0
-"""Rays part this many voxels in front of the first of their surfaces: more than the longest way through one,
-so that no voxel is told by the way in common that it is free, in which a surface may be."""
 
 
 @ti.dataclass
@@ -139,12 +134,8 @@ def send_messages(
                 # In front of all surfaces of the group, forward: nu_j is 0, so only vis_i changes.
                 support, first_step = rays.support[group], worker * trace.longest
                 middle = block_ray(rays.groups[group], sensor, view)
-                begin, apart = begin_depth, begin_depth
-                if rays.first[group + 1] - rays.first[group] > 1:  # a ray alone goes all its way by itself
-                    # The voxel in which the rays part is one in which none of them can have met its surface.
-                    apart = ti.min(support, model.max_depth) - CLEAR_VOXELS / middle.direction.norm()
-                    apart = ti.max(begin, apart)
-                end = apart
+                apart = way_in_common(rays, group, middle, begin_depth, model.max_depth)
+                begin, end = begin_depth, apart
                 clip(middle, begin, end, space.lower, space.upper)
                 common, behind_all, pixels_all = ForwardPass(1.0, 0.0, 0), 0.0, 0.0
                 free_way = _FreeWay(model, swept, trace, first_step, middle.direction.norm())

@@ -5,7 +5,8 @@ quick, but the map depends on the order of events. Settling runs full inference,
 only on its keyframes and their poses, bit for bit.
 """
 
-from collections.abc import Collection, Iterator
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -334,13 +335,17 @@ class Mapper:
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.posed_image, entries)
 
-    def votes_at(self, point: tuple[float, float, float]) -> messages.Votes:
-        """What the keyframes that are on say of the voxel at a point."""
+    def votes_at(self, points: Sequence[tuple[float, float, float]]) -> messages.Votes:
+        """What the keyframes that are on say of the voxels at some points, on average."""
         if not has_messages(self.map) or self.lacks_messages:
-            return messages.Votes(point, (), known=False)
-        said, entries = self.map.votes_at(point), self.roster.with_state("on")
+            return messages.Votes(points[0], (), known=False)
+        said: defaultdict[int, float] = defaultdict(float)
+        for point in points:
+            for map_id, log_odds in self.map.votes_at(point).items():
+                said[map_id] += log_odds / len(points)
+        entries = self.roster.with_state("on")
         votes = [(e.id, said[e.map_id]) for e in entries if e.map_id is not None and e.map_id in said]
-        return messages.Votes(point, tuple(sorted(votes, key=lambda vote: -abs(vote[1]))))
+        return messages.Votes(points[0], tuple(sorted(votes, key=lambda vote: -abs(vote[1]))))
 
     def _frozen(self, entry: LiveKeyframe, crossed: NDArray[np.int32]) -> messages.KeyframeInfo:
         """Note that the map has frozen a keyframe; returns the last message about it."""

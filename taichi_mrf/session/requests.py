@@ -31,6 +31,7 @@ from taichi_mrf.viewer.messages import (
     Step,
     Switch,
     Watch,
+    WhoSays,
 )
 
 _FILES = {"map": MAP_FILE, "ply": VOXEL_FILE, "mesh": MESH_FILE}
@@ -65,6 +66,7 @@ class Requests:
             Freeze: self._freeze,
             RayThrough: self._ray_through,
             PixelRay: self._pixel_ray,
+            WhoSays: lambda request: run.send(run.mapper.votes_at(request.points)),
             Watch: extras.watch,
             ShowTime: lambda request: run.show_time(request.stamp_s),
             Save: self._save,
@@ -119,7 +121,7 @@ class Requests:
             wanted = mapper.posed_image(entry) if entry.state != "frozen" else None
         others = mapper.posed_images_near(np.asarray(request.point, np.float64))
         self._run.send(point_answer(mapper.map, request.point, request.eye, wanted, others))
-        self._run.send(mapper.votes_at(request.point))
+        self._run.send(mapper.votes_at([request.point]))
 
     def _pixel_ray(self, request: PixelRay) -> None:
         mapper = self._run.mapper

@@ -255,9 +255,9 @@ class RayAnswer(Update):
 
 @dataclass(frozen=True)
 class Votes(Update):
-    """What keyframes say of the voxel at a point (metres, world), the strongest first: the number of each,
-    and the log-odds that it adds, above 0 for occupied. ``known`` is False if the map does not keep it, or
-    not yet."""
+    """What keyframes say of the voxel at a point (metres, world), or of those of :class:`WhoSays` on average,
+    the strongest first: the number of each, and the log-odds that it adds, above 0 for occupied. ``known`` is
+    False if the map does not keep it, or not yet."""
 
     point: tuple[float, float, float]
     votes: tuple[tuple[int, float], ...]
@@ -354,6 +354,14 @@ class RayThrough(Request):
     point: tuple[float, float, float]
     eye: tuple[float, float, float]
     keyframe: int | None
+
+
+@dataclass(frozen=True)
+class WhoSays(Request):
+    """Ask what keyframes say of the voxels at some points, (x, y, z) in metres, world; the answer names the
+    first one."""
+
+    points: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,31 @@
-"""Point clouds in bags: fields by name, rings, times, poses; and what is wrong with them."""
+"""Point clouds in bags: fields by name, rings, times, poses, images of beams and columns; and what is wrong
+with them."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bag_clouds import CAMERA, LIDAR, LOST, SCANS, T_BODY_LIDAR, drive, points, pose, send, stamp, write
-from inputs_bags import BODY, Kind, images, mounted, odometry, writing
+from inputs_bags import Bag, Kind, Make, mounted, plain
 from numpy.typing import NDArray
-from refusals import refused
+from point_clouds import in_order
+from refusals import bad_frame, refused
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.ros.lidar import LidarBag, decode
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.datasets.ros.lidar import LidarBag, by_ring, decode, organised
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.spherical import SphericalCamera
+
+
+def cloud(*what: Any, **more: Any) -> Callable[[Bag], None]:
+    """A part of a bag: one cloud."""
+    return lambda bag: send(bag, *what, **more)
 
 
 @pytest.mark.parametrize(("kind", "big"), [("ros1", False), ("sqlite", True), ("mcap", False)])
@@ -24,7 +35,6 @@ def test_a_cloud_with_rows_is_an_image(tmp_path: Path, kind: Kind, big: bool) ->
     assert (len(dataset), dataset.dropped, dataset.stated.reach_m) == (SCANS, 0, 10.0)
     for scan, frame in enumerate(dataset):
         np.testing.assert_allclose(frame.camera.rays(), CAMERA.rays(), atol=1e-5)
-        assert frame.no_return is not None
         np.testing.assert_array_equal(frame.no_return, LOST)
         expected = np.linalg.norm(points(scan), axis=-1)
         np.testing.assert_allclose(frame.depth_m[~LOST], expected[~LOST], rtol=1e-6)
@@ -32,26 +42,22 @@ def test_a_cloud_with_rows_is_an_image(tmp_path: Path, kind: Kind, big: bool) ->
     assert "/points: images of 24 x 4 rays" in dataset.notes
 
 
-def test_rings_make_an_image_and_other_points_free_rays(tmp_path: Path) -> None:
-    ring = np.repeat(np.arange(4, dtype=np.uint16), 24)[::-1][None]
+def test_rings_make_an_image_and_other_points_free_rays(make: Make) -> None:
+    ring, known = np.repeat(np.arange(4, dtype=np.uint16), 24)[::-1][None], ~LOST.reshape(-1)
     flat = points(0).reshape(1, -1, 3)
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), flat, ring=ring)
-        send(bag, stamp(1), flat[:, ~LOST.reshape(-1)], ring=ring[:, ~LOST.reshape(-1)])
-        drive(bag)
-    image, free = open_dataset(tmp_path / "walk")
+    some = cloud(stamp(1), flat[:, known], ring=ring[:, known])
+    image, free = open_dataset(make(cloud(stamp(0), flat, ring=ring), some, drive, kind="mcap"))
     assert image.camera.shape == CAMERA.shape
     np.testing.assert_allclose(image.camera.rays(), CAMERA.rays(), atol=1e-5)
     assert isinstance(free.camera, RayTable)
     assert not free.camera.has_pattern
     assert free.no_return is None
-    found = (free.camera.rays() * free.depth_m[..., None]).reshape(-1, 3)
-    expected = flat[0][~LOST.reshape(-1)]
-    np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)
+    found = free.camera.rays() * free.depth_m[..., None]
+    np.testing.assert_allclose(in_order(found), in_order(flat[0][known]), atol=1e-5)
 
 
 @pytest.mark.parametrize("unit", ["t", "time", "timestamp"])
-def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
+def test_each_column_of_a_scan_has_its_pose(make: Make, unit: str) -> None:
     """Walls that stand still are seen from where the lidar is at the time of each column."""
     seconds = np.tile(np.linspace(-0.04, 0.04, 24), (4, 1))
     where = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds[0]])
@@ -64,10 +70,8 @@ def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
         "timestamp": 1_600_000_000.0 + stamp(0) + seconds,
     }
     first = stamp(0) - 0.04 if unit == "t" else stamp(0)  # unsigned: from the beginning of the scan
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, first, seen, **{unit: times[unit]})
-        drive(bag)
-    frame = open_dataset(tmp_path / "walk").read(0)
+    path = make(cloud(first, seen, **{unit: times[unit]}), drive, kind="mcap")
+    frame = open_dataset(path).read(0)
     T, camera = frame.T_world_camera, frame.camera
     assert isinstance(camera, RayTable)
     assert camera.has_pattern
@@ -77,18 +81,16 @@ def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
     assert off.max() < 0.02, "poses are interpolated on chords"
     starts = starts_at(camera, np.arange(24), 0) @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(starts, where[:, :3, 3], atol=1e-3)
-    skewed = open_dataset(f"{tmp_path / 'walk'}?deskew=false").read(0)
+    skewed = open_dataset(f"{path}?deskew=false").read(0)
     assert skewed.no_return is not None
     np.testing.assert_allclose(skewed.depth_m[~LOST], np.linalg.norm(seen, axis=-1)[~LOST], rtol=1e-5)
 
 
-def test_free_rays_start_where_their_points_were_measured(tmp_path: Path) -> None:
+def test_free_rays_start_where_their_points_were_measured(make: Make) -> None:
     flat = points(0)[~LOST][None]
     seconds = np.linspace(-0.04, 0.04, flat.shape[1], dtype=np.float32)
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), flat, time=seconds[None])
-        drive(bag)
-    frame = open_dataset(tmp_path / "walk").read(0)
+    path = make(cloud(stamp(0), flat, time=seconds[None]), drive, kind="mcap")
+    frame = open_dataset(path).read(0)
     assert isinstance(frame.camera, RayTable)
     assert not frame.camera.has_pattern
     poses = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds])
@@ -99,24 +101,27 @@ def test_free_rays_start_where_their_points_were_measured(tmp_path: Path) -> Non
     assert np.ptp(frame.camera.origins_m[..., 0]) > 0.05
 
 
-def test_a_lidar_that_stands_still_keeps_its_image(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, 1.0, points(0), t=np.tile(np.arange(24, dtype=np.uint32) * 4_000_000, (4, 1)))
+def test_a_lidar_that_stands_still_keeps_its_image(make: Make) -> None:
+    def still(bag: Bag) -> None:
         for i in range(5):
             bag.odometry("/odom", 0.9 + 0.1 * i, "odom", LIDAR, np.eye(4))
-    assert open_dataset(tmp_path / "walk").read(0).camera.shape == CAMERA.shape
+
+    times = np.tile(np.arange(24, dtype=np.uint32) * 4_000_000, (4, 1))
+    path = make(cloud(1.0, points(0), t=times), still, kind="mcap")
+    assert open_dataset(path).read(0).camera.shape == CAMERA.shape
 
 
 @pytest.mark.parametrize("with_tf", [False, True])
-def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(tmp_path: Path, with_tf: bool) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        for scan in range(SCANS):
-            T_odom_lidar = pose(stamp(scan))
-            send(bag, stamp(scan), points(scan) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3], frame="odom")
-            bag.odometry("/odom", stamp(scan), "odom", "body", T_odom_lidar)
+def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(make: Make, with_tf: bool) -> None:
+    def walk(bag: Bag) -> None:
+        for at, xyz in ((stamp(scan), points(scan)) for scan in range(SCANS)):
+            T_odom_lidar = pose(at)
+            send(bag, at, xyz @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3], frame="odom")
+            bag.odometry("/odom", at, "odom", "body", T_odom_lidar)
             if with_tf:
-                bag.tf("/tf", stamp(scan), "odom", "body", T_odom_lidar)
-    dataset = open_dataset(tmp_path / "walk")
+                bag.tf("/tf", at, "odom", "body", T_odom_lidar)
+
+    dataset = open_dataset(make(walk, kind="mcap"))
     assert any("of body, from where the data were moved to odom" in note for note in dataset.notes)
     for scan, frame in enumerate(dataset):
         np.testing.assert_allclose(frame.T_world_camera, pose(stamp(scan)), atol=1e-9)
@@ -124,15 +129,10 @@ def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(tmp_path: Path, wit
         np.testing.assert_allclose(np.sort(frame.depth_m[frame.depth_m > 0]), np.sort(expected), rtol=1e-5)
 
 
-def test_depth_images_come_first_and_points_can_be_chosen(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        images(bag)
-        odometry(bag)
-        mounted(bag)
-        send(bag, stamp(0), points(0))
-        bag.tf("/tf_static", 0.0, BODY, LIDAR, T_BODY_LIDAR)
-    assert open_dataset(tmp_path / "walk").read(0).depth_m.shape == (12, 16)
-    chosen = open_dataset(f"{tmp_path / 'walk'}?points=/points")
+def test_depth_images_come_first_and_points_can_be_chosen(make: Make) -> None:
+    path = make(plain, cloud(stamp(0), points(0)), partial(mounted, child=LIDAR, T=T_BODY_LIDAR), kind="mcap")
+    assert open_dataset(path).read(0).depth_m.shape == (12, 16)
+    chosen = open_dataset(f"{path}?points=/points")
     assert chosen.read(0).camera.shape == CAMERA.shape
 
 
@@ -145,39 +145,31 @@ def test_info_lists_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert f"taichi-mrf map {path} --out DIR" in printed
 
 
-def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
-    with writing(tmp_path / "two", "mcap") as bag:
-        send(bag, 1.0, points(0), "/front/points")
-        send(bag, 1.0, points(0), "/rear/points")
-        drive(bag)
+def test_what_cannot_be_opened_is_named(make: Make, tmp_path: Path) -> None:
+    two = make(
+        cloud(1.0, points(0), "/front/points"),
+        cloud(1.0, points(0), "/rear/points"),
+        drive,
+        kind="mcap",
+        name="two",
+    )
     refused(
-        tmp_path / "two",
+        two,
         "several topics of point clouds: choose one with ?points=/front/points or ?points=/rear/points",
     )
-    refused(f"{tmp_path / 'two'}?points=/odom", "topic /odom is of type nav_msgs/msg/Odometry")
+    refused(f"{two}?points=/odom", "topic /odom is of type nav_msgs/msg/Odometry")
     path = write(tmp_path)
     refused(path, "contains lidar scans; --depth-scale is for depth images", depth_scale=5.0)
-    with writing(tmp_path / "late", "mcap") as bag:
-        send(bag, 50.0, points(0))
-        drive(bag)
-    refused(tmp_path / "late", "none of 1 clouds of /points")
+    late = make(cloud(50.0, points(0)), drive, kind="mcap", name="late")
+    refused(late, "none of 1 clouds of /points")
 
 
-def test_a_broken_cloud_is_named_and_the_others_are_read(tmp_path: Path) -> None:
-    with writing(tmp_path / "walk", "mcap") as bag:
-        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
-        send(bag, stamp(1), points(1))
-        drive(bag)
-    dataset = open_dataset(tmp_path / "walk")
-    with pytest.raises(
-        FrameError, match=r"^frame 000000: .*topic /points: none of 96 points is a measurement"
-    ):
-        dataset.read(0)
+def test_a_broken_cloud_is_named_and_the_others_are_read(make: Make) -> None:
+    broken = cloud(stamp(0), np.full((4, 24, 3), np.nan))
+    dataset = open_dataset(make(broken, cloud(stamp(1), points(1)), drive, kind="mcap"))
+    bad_frame(dataset, 0, "topic /points: none of 96 points is a measurement")
     assert dataset.camera == dataset.read(1).camera
-    with writing(tmp_path / "none", "mcap") as bag:
-        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
-        drive(bag)
-    refused(tmp_path / "none", "no cloud can be read: frame 000000")
+    refused(make(broken, drive, kind="mcap"), "no cloud can be read: frame 000000")
 
 
 class Message:
@@ -221,3 +213,85 @@ def test_times_that_are_far_from_the_stamp_are_not_believed(times: NDArray) -> N
     rows["time"] = times
     cloud = decode(Message(fields=fields, point_step=20, row_step=40, data=rows.view(np.uint8)), 100.0)
     assert cloud.seconds is None
+
+
+ELEVATIONS = np.linspace(0.4, -0.3, 6)
+AZIMUTHS = 1.0 - 2 * np.pi * np.arange(32) / 32
+NOTHING_BACK = np.random.default_rng(3).random((6, 32)) < 0.3
+
+
+def lidar(offsets: NDArray | None = None) -> SphericalCamera:
+    return SphericalCamera(ELEVATIONS, AZIMUTHS, offsets)
+
+
+def scan(camera: SphericalCamera, nothing: float = np.nan) -> NDArray:
+    """Points (H, W, 3) at random ranges, some without a return."""
+    ranges = np.random.default_rng(1).uniform(2.0, 9.0, camera.shape)
+    points = camera.rays() * ranges[..., None]
+    points[NOTHING_BACK] = nothing
+    return points
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+@pytest.mark.parametrize("offsets", [None, np.array([0.05, -0.04, 0.0, 0.02, 0.06, -0.03])])
+def test_all_rays_come_back(nothing: float, offsets: NDArray | None) -> None:
+    camera = lidar(offsets)
+    found = organised(scan(camera, nothing))
+    assert found is not None
+    image, numbers = found
+    table, range_m = image.camera, image.range_m
+    np.testing.assert_array_equal(image.no_return, NOTHING_BACK)
+    np.testing.assert_array_equal(numbers, np.arange(NOTHING_BACK.size).reshape(NOTHING_BACK.shape))
+    np.testing.assert_array_equal(range_m > 0, ~NOTHING_BACK)
+    np.testing.assert_allclose(table.rays(), camera.rays(), atol=1e-6)
+    np.testing.assert_allclose(
+        (table.rays() * range_m[..., None])[~NOTHING_BACK], scan(camera)[~NOTHING_BACK], atol=1e-5
+    )
+
+
+def test_rows_that_are_whole_columns_ahead_are_shifted_back() -> None:
+    camera = lidar()
+    shifts = [0, 3, 0, -2, 9, 1]
+    staggered = np.stack(
+        [np.roll(row, shift, axis=0) for shift, row in zip(shifts, scan(camera), strict=True)]
+    )
+    found, plain = organised(staggered), organised(scan(camera))
+    assert plain is not None
+    rays = found[0].camera.rays()
+    across = np.diff(np.unwrap(np.arctan2(rays[..., 1], rays[..., 0]), axis=0), axis=0)
+    assert np.abs(across).max() < 1e-5, "a column has one azimuth"
+    np.testing.assert_array_equal(found[0].no_return.sum(axis=1), NOTHING_BACK.sum(axis=1))
+    ranges = (np.sort(each.range_m, axis=None) for each, _ in (found, plain))
+    np.testing.assert_allclose(*ranges)
+    points, measured = staggered.reshape(-1, 3)[found[1]], found[0].range_m > 0
+    np.testing.assert_allclose(
+        np.linalg.norm(points, axis=-1)[measured], found[0].range_m[measured], rtol=1e-6
+    )
+
+
+def test_a_row_without_a_return_lies_between_its_neighbours() -> None:
+    points = scan(lidar())
+    points[2] = np.nan
+    found = organised(points)
+    np.testing.assert_allclose(found[0].camera.rays()[2], lidar().rays()[2], atol=1e-6)
+
+
+def test_points_in_no_order_are_no_image() -> None:
+    points = scan(lidar()).reshape(-1, 3)
+    assert organised(np.random.default_rng(2).permutation(points).reshape(6, 32, 3)) is None
+    assert organised(points[None]) is None
+    assert organised(np.full((6, 32, 3), np.nan)) is None
+    part = scan(lidar())[:, :12]  # of a turn
+    assert organised(part) is not None
+    assert organised(np.stack([np.roll(row, 2 * i, axis=0) for i, row in enumerate(part)])) is None
+
+
+def test_rings_make_an_image_if_they_are_equally_long() -> None:
+    points = scan(lidar())
+    ring = np.repeat(np.array([5, 4, 3, 2, 1, 0]), 32)
+    order = np.argsort(np.tile(np.arange(32), 6), kind="stable")  # column by column, as drivers write
+    numbers = by_ring(points.reshape(-1, 3)[order], ring[order])
+    assert numbers is not None
+    np.testing.assert_array_equal(points.reshape(-1, 3)[order][numbers], points)
+    assert by_ring(points.reshape(-1, 3)[1:], ring[1:]) is None
+    assert by_ring(points.reshape(-1, 3), np.zeros(192, int)) is None

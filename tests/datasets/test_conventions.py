@@ -1,5 +1,5 @@
-"""Poses and depths in other conventions come out as those of the same recording in this package's, and an
-origin far away is moved, in every format and for poses of a file."""
+"""Poses and depths in other conventions come out as those of the same recording in this package's, an origin
+far away is moved, and frames agree on the steps per metre."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_recordings import body, opengl, w_first
-from datasets_recordings import CAMERA, FORMATS, Content, stamped_line
+from datasets_recordings import (
+    CAMERA,
+    Content,
+    write_image,
+    write_log,
+    write_rows,
+    write_stamped,
+    write_tum,
+)
 from every_format import EVERY
 from refusals import refused
 
@@ -17,7 +25,8 @@ from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.geometry.poses import Pose, inverse, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
 
 ORIGIN = np.array([412_345.25, 5_412_345.75, 312.5])
 MOUNTING = (0.1, -0.2, 0.3, 0.5, -0.5, 0.5, -0.5)
@@ -78,13 +87,11 @@ def test_an_origin_far_away_is_moved(name: str, tmp_path: Path) -> None:
 
 def test_poses_of_a_file_have_conventions_and_an_origin_too(tmp_path: Path) -> None:
     content = Content()
-    folder = FORMATS["tum"][0](tmp_path / "recording", content)
+    folder = write_tum(tmp_path / "recording", content)
     stamps = open_dataset(folder, camera=CAMERA).stamps()
-    lines = [
-        stamped_line(s + 0.25, inverse(moved(T, ORIGIN))) for s, T in zip(stamps, content.poses, strict=True)
-    ]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
-    dataset = open_posed(folder, tmp_path / "poses.txt", poses_are="inverse,late=0.25", camera=CAMERA)
+    inverses = [inverse(moved(T, ORIGIN)) for T in content.poses]
+    poses = write_stamped(tmp_path / "poses.txt", np.array(stamps) + 0.25, inverses)
+    dataset = open_posed(folder, poses, poses_are="inverse,late=0.25", camera=CAMERA)
     found = [moved(dataset.pose(i), dataset.origin_m) for i in range(5)]
     assert np.allclose(found, [moved(T, ORIGIN) for T in content.poses], atol=1e-5)
     assert np.array_equal(dataset.read(3).T_world_camera, dataset.pose(3))
@@ -94,7 +101,7 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
     """The camera moves 1 m/s along x: half a second late is half a metre."""
     content = Content()
     content.poses = [moved(np.eye(4), [i / 30, 0.0, 0.0]) for i in range(5)]
-    folder = FORMATS["tum"][0](tmp_path / "recording", content)
+    folder = write_tum(tmp_path / "recording", content)
     plain = open_dataset(folder, camera=CAMERA)
     step = plain.stamps()[1] - plain.stamps()[0]
     dataset = open_dataset(folder, camera=CAMERA, poses_are=f"late={0.5 * step}")
@@ -108,7 +115,7 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
 
 
 def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:
-    folder = FORMATS["tum"][0](tmp_path / "recording", Content())
+    folder = write_tum(tmp_path / "recording", Content())
     plain = open_dataset(folder, camera=CAMERA).read(2)
     axial = open_dataset(folder, camera=CAMERA, depth_is="range").read(2)
     u, v = np.meshgrid(np.arange(16), np.arange(12))
@@ -136,3 +143,93 @@ def test_flags_say_their_conventions() -> None:
     given = ("--poses-are wxyz,inverse,ros,late=0.5", "--mounting 1,2,3,0,0,0,1", "--depth-is range")
     found = conventions_of("ros,late=0.5,inverse,wxyz", (1, 2, 3, 0, 0, 0, 1), "range")
     assert tuple(found.flags()) == given
+
+
+WIDE = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
+ROOM = np.array([2.5, 2.0, 1.5])
+"""Half the sides of an empty room in metres."""
+
+
+def room_depth_m(T_world_camera: Pose) -> np.ndarray:
+    """Axial depth (60, 80) of the room's walls, from inside."""
+    directions = WIDE.rays() @ T_world_camera[:3, :3].T
+    with np.errstate(divide="ignore"):
+        to_walls = (np.sign(directions) * ROOM - T_world_camera[:3, 3]) / directions
+    return np.nanmin(np.where(directions == 0, np.inf, to_walls), axis=-1)
+
+
+def walk(frames: int, step_m: float, turn: float = 0.0) -> list[Pose]:
+    """It turns by so many radians from one frame to the next."""
+    eyes = [np.array([step_m * i - 0.8, 0.3 - step_m * i / 2, 0.1]) for i in range(frames)]
+    ahead = [(1 + 0.8j) * np.exp(1j * turn * i) for i in range(frames)]
+    return [look_at(e, (e[0] + a.real, e[1] + a.imag, -0.2)) for e, a in zip(eyes, ahead, strict=True)]
+
+
+def write_room(
+    folder: Path, steps_per_metre: float, step_m: float = 0.04, layout: str = "rows", turn: float = 0.0
+) -> Path:
+    """A walk through the room as numbered images with K.txt."""
+    folder.mkdir()
+    poses = walk(30, step_m, turn)
+    for number, pose in enumerate(poses):
+        steps = np.rint(room_depth_m(pose) * steps_per_metre).astype(np.uint16)
+        write_image(folder / f"{number:04d}.png", steps)
+    (folder / "K.txt").write_text("70 0 39.5\n0 70 29.5\n0 0 1\n")
+    if layout == "log":
+        write_log(folder / "poses.log", poses)
+    else:
+        write_rows(folder / "poses.txt", poses)
+    return folder
+
+
+@pytest.mark.parametrize("layout", ["rows", "log"])
+@pytest.mark.parametrize("steps", [1000.0, 5000.0])
+def test_an_assumed_scale_is_replaced_by_the_one_that_fits(tmp_path: Path, steps: float, layout: str) -> None:
+    dataset = open_dataset(write_room(tmp_path / "mine", steps, layout=layout))
+    assert dataset.camera == WIDE
+    np.testing.assert_allclose(dataset.read(7).depth_m, room_depth_m(walk(30, 0.04)[7]), atol=1e-3)
+    (note,) = [note for note in dataset.notes if note.startswith("depth:")]
+    assert note.startswith(f"depth: {steps:g} steps per metre")
+    assert note.endswith("--depth-scale sets another")
+    found = steps != (1000.0 if layout == "log" else 5000.0)
+    assert ("found by comparing neighbouring frames" in note) == found
+    assert ("neighbouring frames differ by 0." in note) == (not found)
+
+
+def test_a_scale_of_the_format_gives_way_to_the_poses(tmp_path: Path) -> None:
+    """As of recorders that write the layout of TUM RGB-D with millimetres."""
+    written, folder = open_dataset(write_room(tmp_path / "mine", 1000.0)), tmp_path / "tum"
+    stamps = [i / 10 for i in range(len(written))]
+    for stamp, frame in zip(stamps, written, strict=True):
+        image = np.rint(1000 * frame.depth_m).astype(np.uint16)
+        write_image(folder / f"depth/{stamp:.6f}.png", image)
+    write_stamped(folder / "groundtruth.txt", stamps, [frame.T_world_camera for frame in written])
+    dataset = open_dataset(folder, camera=written.camera)
+    assert any("found by comparing neighbouring frames" in note for note in dataset.notes)
+    np.testing.assert_allclose(dataset.read(3).depth_m, written.read(3).depth_m, atol=1e-3)
+
+
+def test_a_camera_that_stands_still_does_not_tell(tmp_path: Path) -> None:
+    folder = write_room(tmp_path / "mine", 1000.0, step_m=0.0)
+    said = "depth: 5000 steps per metre (assumed as Redwood has it): the median depth is 0."
+    assert said in open_dataset(folder).notes[0]
+    (note,) = open_dataset(folder, depth_scale=100_000.0).notes
+    assert "make a median depth of 0.0" in note
+    assert "not plausible; check --depth-scale" in note
+
+
+def test_a_scale_that_is_given_is_kept_and_doubted(tmp_path: Path) -> None:
+    folder = write_room(tmp_path / "mine", 1000.0)
+    assert open_dataset(folder, depth_scale=1000.0).notes == []
+    dataset = open_dataset(folder, depth_scale=5000.0)
+    np.testing.assert_allclose(dataset.read(0).depth_m * 5, room_depth_m(walk(30, 0.04)[0]), atol=2e-3)
+    (note,) = dataset.notes
+    assert "5000 steps per metre (--depth-scale) do not fit the recorded poses" in note
+    assert "at 1000 by 0." in note
+    assert open_dataset(folder, depth_scale=5000.0, track=True).notes == []  # its poses do not count
+
+
+def test_the_scale_is_found_where_the_camera_turns_fast(tmp_path: Path) -> None:
+    dataset = open_dataset(write_room(tmp_path / "mine", 1000.0, step_m=0.11, turn=0.6))
+    assert any("found by comparing neighbouring frames" in note for note in dataset.notes)
+    np.testing.assert_allclose(dataset.read(3).depth_m, room_depth_m(walk(4, 0.11, 0.6)[3]), atol=1e-3)

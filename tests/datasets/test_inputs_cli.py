@@ -1,7 +1,5 @@
 """What the program says of sources, and the flags that say how one is read."""
 
-import contextlib
-import io
 import json
 import re
 import shlex
@@ -14,7 +12,6 @@ from console import taichi_mrf
 from datasets_recordings import CAMERA, Content, write_seven_scenes
 from inputs_bags import Bag, writing
 
-from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.summary import UNUSED_COLOR
 from taichi_mrf.export.formats import export_map
@@ -22,11 +19,9 @@ from taichi_mrf.geometry.poses import look_at
 
 
 def said(*arguments: str | Path) -> tuple[int, str, str]:
-    """Exit status, output and errors of the program, in this process."""
-    out, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
-        status = main([str(argument) for argument in arguments])
-    return status, out.getvalue(), errors.getvalue()
+    """Exit status, output and errors of the program."""
+    done = taichi_mrf(*arguments)
+    return done.returncode, done.stdout, done.stderr
 
 
 @pytest.fixture(autouse=True)
@@ -153,13 +148,9 @@ def test_info_of_the_room(one_backend: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["nowhere"], "no such folder or file"),
         (["nowhere.bag"], "no such folder or file"),
         (["{}", "--image-scale", "0.3"], "image_scale must be 1, 0.5"),
-        (["{}", "--depth-scale", "-1"], "depth_scale must be"),
         (["{}", "--undistort=-0.1,0.2"], "--undistort takes k1,k2,p1,p2"),
-        (["{}", "--camera", "1,2,3"], "--camera takes fx,fy,cx,cy"),
-        (["{}", "--max-time-gap", "-2"], "max_time_gap must be"),
     ],
 )
 def test_bad_sources_and_values_end_in_one_line(tmp_path: Path, arguments: list[str], words: str) -> None:

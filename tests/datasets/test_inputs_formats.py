@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from datasets_recordings import (
     CAMERA,
-    CAMERA_TXT,
     INTRINSIC,
     Content,
     K,
@@ -23,10 +22,9 @@ from datasets_recordings import (
     write_replica,
     write_scannet,
 )
-from refusals import refused
+from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.session.source import open_source
@@ -37,12 +35,13 @@ def content() -> Content:
     return Content()
 
 
-def test_scannet(tmp_path: Path, content: Content) -> None:
-    folder = write_scannet(tmp_path / "scene0000_00", content)
-    dataset = open_dataset(folder)
-    check_frames(dataset, content, 1000.0)
+def test_scannet_and_replica_need_no_note(tmp_path: Path, content: Content) -> None:
+    dataset = open_dataset(write_scannet(tmp_path / "scene0000_00", content))
     assert list(dataset.frame_names) == ["0", "5", "10", "15", "20"]
     assert dataset.notes == []
+    assert open_dataset(write_replica(tmp_path / "room0", content)).notes == []
+    beside = write_replica(tmp_path / "room1" / "own", content, ".")
+    check_frames(open_dataset(beside), content, 6553.5, colored=True)
 
 
 def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Content) -> None:
@@ -52,8 +51,7 @@ def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Conten
     dataset = open_dataset(folder)
     assert (list(dataset.frame_names), dataset.dropped) == (["0", "10", "15", "20"], 1)
     assert "1 of 5 images dropped: tracking was lost" in dataset.notes
-    with pytest.raises(FrameError, match=r"frame 15: .*15\.txt: the pose is missing"):
-        dataset.read(2)
+    bad_frame(dataset, 2, "15.txt: the pose is missing")
     for path in (folder / "pose").iterdir():
         path.write_text("-inf -inf -inf -inf\n" * 4)
     (folder / "pose/15.txt").write_text("inf")
@@ -87,7 +85,6 @@ def test_scannets_colours_are_registered_to_depth(tmp_path: Path, content: Conte
     dataset = open_dataset(folder)
     assert dataset.notes == []
     color = dataset.read(0).color
-    assert color is not None
     # On a wall in 2 m the colour camera sees the depth camera's pixel u at this column.
     u = (CAMERA.rays()[0, :, 0] * 2.0 - 0.05) / 2.0 * WIDE.fx + WIDE.cx
     inside = (u >= 0) & (u <= 39)
@@ -110,18 +107,9 @@ def test_scannets_colours_without_their_camera(tmp_path: Path, content: Content)
     assert [note for note in dataset.notes if "intrinsic_color.txt" in note]
 
 
-@pytest.mark.parametrize("place", [".", ".."], ids=["beside", "above"])
-def test_replica(tmp_path: Path, content: Content, place: str) -> None:
-    folder = tmp_path / "room0"
-    folder.mkdir()
-    dataset = open_dataset(write_replica(folder, content, folder / place / "cam_params.json"))
-    check_frames(dataset, content, 6553.5, colored=True)
-    assert dataset.notes == []
-
-
 def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     content = Content(2, (680, 1200))
-    folder = write_replica(tmp_path, content, tmp_path / "cam_params.json")
+    folder = write_replica(tmp_path, content, ".")
     (folder / "cam_params.json").write_text('{"camera": {"w": 16}}')
     refused(folder, "cam_params.json: camera needs the numbers w, h")
     (folder / "cam_params.json").write_text("{")
@@ -132,14 +120,6 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     refused(folder, "one for each depth image, found 1 poses")
     (folder / "traj.txt").unlink()
     refused(folder, "traj.txt: is missing")
-
-
-def test_open3d_with_a_log(tmp_path: Path, content: Content) -> None:
-    folder = write_numbered(tmp_path, content, place="depth")
-    (folder / "camera.txt").unlink()
-    (folder / "camera_intrinsic.json").write_text(json.dumps(INTRINSIC))
-    write_log(folder / "trajectory.log", content.poses)
-    check_frames(open_dataset(folder), content, 1000.0, colored=True)
 
 
 @pytest.mark.parametrize("kind", ["PinholeCameraTrajectory", "PoseGraph"])
@@ -192,8 +172,6 @@ def test_npz(tmp_path: Path, content: Content) -> None:
     assert [frame.stamp for frame in dataset] == [0.0, 0.5, 1.0, 1.5, 2.0]
     assert list(dataset.frame_names) == [f"walk-{i:06d}" for i in range(5)]
     assert open_dataset(path, color=False).read(0).color is None
-    with pytest.raises(IndexError, match="5 frames"):
-        dataset.read(5)
 
 
 def test_npz_of_steps_and_numbers(tmp_path: Path, content: Content) -> None:
@@ -274,8 +252,7 @@ def test_a_broken_pose_of_an_npz_is_one_frames(tmp_path: Path, content: Content)
     values = arrays(content)
     values["T_world_camera"][1] *= 2
     dataset = open_dataset(write_npz(tmp_path / "walk.npz", values))
-    with pytest.raises(FrameError, match=r"frame walk-000001: .*walk\.npz: T_world_camera"):
-        dataset.read(1)
+    bad_frame(dataset, 1, "walk.npz: T_world_camera")
     assert (dataset.read(2).depth_m > 0).any()
 
 
@@ -292,8 +269,7 @@ def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) 
     position = data.find(b"depth_m.npy") + 50_000
     data[position : position + 40] = bytes(40)
     path.write_bytes(data)
-    with pytest.raises(FrameError, match=r"walk-000000: .*walk\.npz: depth_m cannot be read"):
-        open_dataset(path).read(0)
+    bad_frame(open_dataset(path), 0, "walk-000000:", "walk.npz: depth_m cannot be read")
 
 
 def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
@@ -320,5 +296,4 @@ def test_the_coffin_scene_is_such_a_file(shared_data: Path) -> None:
     dataset = open_dataset(shared_data / "coffin_world" / "clean_depth.npz")
     frame = dataset.read(len(dataset) - 1)
     assert 0.1 < np.median(frame.depth_m[frame.depth_m > 0]) < 10
-    assert CAMERA_TXT  # the recordings of the other formats are of another size
     assert frame.depth_m.shape == dataset.camera.shape

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets_recordings import stamped_line
+from datasets_recordings import write_stamped
 from numpy.typing import NDArray
 from refusals import refused
 
@@ -114,15 +114,25 @@ def driving() -> NDArray:
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
-    (tmp_path / "walk.osf").write_bytes(osf(b"OSF$", b"OSF!", b"OSF#"))
-    return tmp_path / "walk.osf"
+def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> "Play":
+    """An OSF file for which ouster-sdk gives a source; returns its path."""
+
+    def play(source: object, data: bytes = WHOLE) -> Path:
+        install(monkeypatch, source)
+        (tmp_path / "walk.osf").write_bytes(data)
+        return tmp_path / "walk.osf"
+
+    return play
 
 
 def osf(*names: bytes) -> bytes:
     """An OSF file of blocks with these names, which hold a few bytes."""
     blocks = (struct.pack("<II", 28, 20) + name + bytes(range(20)) for name in names)
     return b"".join(block + struct.pack("<I", zlib.crc32(block)) for block in blocks)
+
+
+WHOLE = osf(b"OSF$", b"OSF!", b"OSF#")
+Play = Callable[..., Path]
 
 
 def install(monkeypatch: pytest.MonkeyPatch, source: object) -> None:
@@ -135,24 +145,21 @@ def install(monkeypatch: pytest.MonkeyPatch, source: object) -> None:
     monkeypatch.setitem(sys.modules, "ouster.sdk", SimpleNamespace(open_source=open_source))
 
 
-def test_a_sensor_that_stands_still_gives_images(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sensor_that_stands_still_gives_images(played: Play) -> None:
     ranges = np.full((ROWS, COLUMNS), 5000, np.uint32)
     ranges[1, 4] = 0
-    install(monkeypatch, Source([STILL, STILL], ranges))
-    dataset = open_dataset(recording)
+    dataset = open_dataset(played(Source([STILL, STILL], ranges)))
     frame = dataset.read(1)
     assert (len(dataset), frame.name, dataset.stated.reach_m) == (2, "000001", 10.0)
     assert frame.camera == dataset.camera
-    assert frame.no_return is not None
     assert np.argwhere(frame.no_return).tolist() == [[1, 4 + SHIFTS[1]]]
     np.testing.assert_allclose(frame.T_world_camera[:3, :3], TURNED[:3, :3])
     assert frame.stamp == pytest.approx(10.15)
     assert any("assumed to stand still" in note for note in dataset.notes)
 
 
-def test_columns_start_where_the_sensor_was(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Source([driving()])
-    install(monkeypatch, source)
+def test_columns_start_where_the_sensor_was(played: Play) -> None:
+    recording = played(Source([driving()]))
     frame = open_dataset(recording).read(0)
     T, camera = frame.T_world_camera, frame.camera
     assert isinstance(camera, RayTable)
@@ -161,7 +168,6 @@ def test_columns_start_where_the_sensor_was(recording: Path, monkeypatch: pytest
     expected = points(np.full((ROWS, COLUMNS), 5.0)) @ TURNED[:3, :3].T + [0, 0, 0.04]
     expected += driving()[None, :, :3, 3]
     found = frame.points_m @ T[:3, :3].T + T[:3, 3]
-    assert frame.no_return is not None
     assert not frame.no_return.any()
     for row, shift in enumerate(SHIFTS):
         own = slice(shift, shift + COLUMNS)
@@ -174,12 +180,11 @@ def test_columns_start_where_the_sensor_was(recording: Path, monkeypatch: pytest
     np.testing.assert_allclose(rigid.T_world_camera[:3, 3], [0.5, 0, 0.04], atol=1e-6)
 
 
-def test_poses_of_a_file(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, Source([STILL, STILL, STILL]))
+def test_poses_of_a_file(played: Play, tmp_path: Path) -> None:
+    recording = played(Source([STILL, STILL, STILL]))
     T = look_at([1.0, 2.0, 3.0], [4.0, 2.0, 3.0])
-    lines = [stamped_line(stamp, T) for stamp in (10.0, 10.1, 10.2)]
-    (recording.parent / "poses.txt").write_text("\n".join(lines))
-    dataset = open_dataset(f"{recording}?poses={recording.parent / 'poses.txt'}")
+    poses = write_stamped(tmp_path / "poses.txt", (10.0, 10.1, 10.2), [T] * 3)
+    dataset = open_dataset(f"{recording}?poses={poses}")
     assert (len(dataset), dataset.dropped) == (2, 1)
     expected = T @ Beams.of(metadata()).T_sensor_lidar
     np.testing.assert_allclose(dataset.read(0).T_world_camera, expected, atol=1e-6)
@@ -195,45 +200,33 @@ def test_poses_of_a_file(recording: Path, monkeypatch: pytest.MonkeyPatch) -> No
         (Source([STILL]), "?sensors=1", "unknown parameter 'sensors'"),
     ],
 )
-def test_what_cannot_be_opened_is_named(
-    recording: Path, monkeypatch: pytest.MonkeyPatch, source: object, query: str, problem: str
-) -> None:
-    install(monkeypatch, source)
+def test_what_cannot_be_opened_is_named(played: Play, source: object, query: str, problem: str) -> None:
+    recording = played(source)
     refused(f"{recording}{query}", str(recording), problem)
 
 
-def test_the_reach_is_that_of_the_first_scan_with_returns(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_reach_is_that_of_the_first_scan_with_returns(played: Play) -> None:
     source = Source([STILL, STILL])
     source.frames[0].field = lambda name: np.zeros((ROWS, COLUMNS), np.uint32)
     source.frames[1].field = lambda name: np.full((ROWS, COLUMNS), 23_000, np.uint32)
-    install(monkeypatch, source)
-    assert open_dataset(recording).stated.reach_m == 30.0
+    assert open_dataset(played(source)).stated.reach_m == 30.0
 
 
-def test_a_sensor_that_moves_between_scans_does_not_stand_still(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_that_moves_between_scans_does_not_stand_still(played: Play) -> None:
     moved = STILL.copy()
     moved[:, 0, 3] = 2.0
-    install(monkeypatch, Source([STILL, moved]))
-    assert not any("stand still" in note for note in open_dataset(recording).notes)
+    dataset = open_dataset(played(Source([STILL, moved])))
+    assert not any("stand still" in note for note in dataset.notes)
 
 
-def test_a_scan_without_returns_says_so(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scan_without_returns_says_so(played: Play) -> None:
     source = Source([STILL, STILL])
-    install(monkeypatch, source)
-    dataset = open_dataset(recording)
+    dataset = open_dataset(played(source))
     source.frames[1].field = lambda name: np.zeros((ROWS, COLUMNS), np.uint32)
     source.frames[1].status = np.arange(COLUMNS, dtype=np.uint32) % 2
     frame = dataset.read(1)
     assert not frame.depth_m.any()
-    assert frame.no_return is not None
     assert frame.no_return.mean() == 0.5
-
-
-WHOLE = osf(b"OSF$", b"OSF!", b"OSF#")
 
 
 @pytest.mark.parametrize(
@@ -254,10 +247,9 @@ WHOLE = osf(b"OSF$", b"OSF!", b"OSF#")
     ],
 )
 def test_a_damaged_osf_is_refused_before_the_library_reads_it(
-    recording: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, problem: str
+    played: Play, data: bytes, problem: str
 ) -> None:
-    install(monkeypatch, AssertionError("the library read it"))
-    recording.write_bytes(data)
+    recording = played(AssertionError("the library read it"), data)
     assert refused(recording, problem).startswith(f"{recording}: ")
 
 

@@ -1,4 +1,7 @@
-"""The synthetic room: its pictures agree with its geometry, its geometry with plain formulas."""
+"""The synthetic room: its pictures agree with its geometry, that with plain formulas; with a pattern, and
+with things that move."""
+
+import math
 
 import numpy as np
 import pytest
@@ -9,7 +12,19 @@ from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
-from taichi_mrf.datasets.synthetic.room import SyntheticRoom
+from taichi_mrf.datasets.synthetic.rendered_sequence import CONTRAST, CUBES_M, pattern
+from taichi_mrf.datasets.synthetic.room import (
+    PERIOD_S,
+    SCRIPTS,
+    Place,
+    Stay,
+    SyntheticRoom,
+    Thing,
+    distance_to_solids,
+    moving_room,
+    placed,
+    way,
+)
 from taichi_mrf.datasets.synthetic.room_furniture import (
     HEIGHT,
     LENGTH,
@@ -36,12 +51,6 @@ solids = st.builds(
     half_size=st.tuples(size, size, size),
     yaw=st.floats(-4, 4),
 )
-
-
-def opened(source: str) -> SyntheticRoom:
-    dataset = open_dataset(source)
-    assert isinstance(dataset, SyntheticRoom)
-    return dataset
 
 
 def world_rays(camera: PinholeCamera, T: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -154,22 +163,13 @@ def test_any_camera_sees_the_same_scene(backend: str) -> None:
 
 @pytest.mark.parametrize("index", range(0, 60, 7))
 def test_clean_depth_lies_on_the_surface_and_before_all_others(backend: str, index: int) -> None:
-    room = opened(SMALL)
+    room = open_dataset(SMALL)
     T, depth = room.pose(index), room.clean_depth(index).astype(np.float64).ravel()
     rays = world_rays(room.camera, T)
     assert (depth > 0).all()  # the room is closed
     assert np.abs(room.signed_distance(T[:3, 3] + depth[:, None] * rays)).max() < 1e-4
     for share in (0.1, 0.3, 0.5, 0.7, 0.9, 0.97):
         assert room.signed_distance(T[:3, 3] + (share * depth)[:, None] * rays).min() > -1e-4
-
-
-def test_depth_is_axial(backend: str) -> None:
-    """A camera square to a wall sees one depth everywhere."""
-    from taichi_mrf.datasets.synthetic.analytic_render import render
-
-    scene = Scene((Solid("box", (3.0, 0.0, 0.0), (1.0, 50.0, 50.0)),), light=(0, 0, 1))
-    depth, _ = render(scene, CAMERA, look_at((0, 0, 0), (1, 0, 0)), color=False)
-    np.testing.assert_allclose(depth, 2.0, atol=1e-6)
 
 
 def test_the_room_is_a_furnished_room_around_the_origin() -> None:
@@ -202,7 +202,7 @@ def test_the_camera_keeps_clear_moves_smoothly_and_closes_its_loop() -> None:
 
 
 def test_all_walls_and_most_of_the_room_are_seen(backend: str) -> None:
-    room = opened("synthetic:room?width=80&height=60&frames=30&noise=none")
+    room = open_dataset("synthetic:room?width=80&height=60&frames=30&noise=none")
     points = []
     for i in range(len(room)):
         T, depth = room.pose(i), room.clean_depth(i).astype(np.float64).reshape(-1, 1)
@@ -213,17 +213,17 @@ def test_all_walls_and_most_of_the_room_are_seen(backend: str) -> None:
 
 
 def test_frames_are_deterministic_whatever_the_order(backend: str) -> None:
-    once = {i: opened(SMALL).read(i) for i in (2, 5)}
-    room = opened(SMALL)
+    once = {i: open_dataset(SMALL).read(i) for i in (2, 5)}
+    room = open_dataset(SMALL)
     for i in (5, 2):
         again = room.read(i)
         np.testing.assert_array_equal(again.depth_m, once[i].depth_m)
         np.testing.assert_array_equal(again.color, once[i].color)
-    assert (opened(SMALL + "&seed=1").read(2).depth_m != once[2].depth_m).any()
+    assert (open_dataset(SMALL + "&seed=1").read(2).depth_m != once[2].depth_m).any()
 
 
 def test_noise_is_that_of_a_kinect(backend: str) -> None:
-    room = opened("synthetic:room?width=640&height=480&frames=60")
+    room = open_dataset("synthetic:room?width=640&height=480&frames=60")
     clean, noisy = room.clean_depth(50).astype(np.float64), room.read(50).depth_m.astype(np.float64)
     seen = noisy > 0
     assert 0.8 < seen.mean() < 0.999
@@ -236,23 +236,25 @@ def test_noise_is_that_of_a_kinect(backend: str) -> None:
 
 
 def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
-    room = opened(SMALL + "&noise=none")
+    room = open_dataset(SMALL + "&noise=none")
     frame = room.read(3)
     np.testing.assert_array_equal(frame.depth_m, room.clean_depth(3))
     np.testing.assert_array_equal(frame.T_world_camera, room.pose(3))
     assert frame.camera == room.camera == CAMERA
     assert frame.name == room.frame_names[3]
-    assert frame.color is not None
     assert frame.color.shape == (120, 160, 3)
     assert len(np.unique(frame.color.reshape(-1, 3), axis=0)) > 500
     assert open_dataset(SMALL, color=False).read(3).color is None
 
 
 def test_options_and_defaults() -> None:
-    room = opened("synthetic:room")
+    room = open_dataset("synthetic:room")
     assert len(room) == len(room.frame_names) == 32
+    assert room.moving_scene is None
+    assert room.scene_at(3) is room.scene
+    assert room.stamp_at(5) == 1.0
     assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
-    assert len(opened("synthetic:room?frames=7&seed=3&noise=none")) == 7
+    assert len(open_dataset("synthetic:room?frames=7&seed=3&noise=none")) == 7
     assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
     with pytest.raises(IndexError):
         room.read(32)
@@ -293,4 +295,162 @@ def test_a_depth_scale_has_no_meaning_here(name: str) -> None:
 def test_rendering_before_taichi_runs_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "active", lambda: None)
     with pytest.raises(BackendError, match=r"call taichi_mrf\.init\(\) first"):
-        opened(SMALL).read(0)
+        open_dataset(SMALL).read(0)
+
+
+MOTTLED_SIZE = "synthetic:room?width=80&height=60&frames=60"
+
+
+def test_a_pattern_is_continuous_and_neither_brightens_nor_darkens() -> None:
+    points_m = np.random.default_rng(1).uniform(-5, 5, (20_000, 3))
+    fine = np.full(len(points_m), 1e-3)
+    factor = pattern(points_m, fine)
+    assert abs(factor.mean() - 1) < 0.01
+    assert factor.std() > 0.1
+    assert factor.max() <= (1 + CONTRAST) ** 3
+    assert factor.min() >= (1 - CONTRAST) ** 3
+    step = np.array([1e-4, -1e-4, 1e-4])
+    # The slope of smoothed interpolation is at most 1.5 for each cube's side and axis.
+    steepest = factor.max() * 3 * 2 * CONTRAST * 1.5 / (1 - CONTRAST) / min(CUBES_M)
+    assert np.abs(pattern(points_m + step, fine) - factor).max() < steepest * 1e-4
+    # Wide pixels see plain paint.
+    np.testing.assert_array_equal(pattern(points_m, np.full(len(points_m), 0.5)), 1.0)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_mottled_room_has_the_same_depth_and_the_pattern_of_its_points() -> None:
+    plain, mottled = open_dataset(MOTTLED_SIZE), open_dataset(f"{MOTTLED_SIZE}&texture=mottled")
+    assert isinstance(mottled, SyntheticRoom)
+    a, b = plain.read(7), mottled.read(7)
+    np.testing.assert_array_equal(a.depth_m, b.depth_m)
+    assert a.color is not None
+    assert b.color is not None
+    depth_m = mottled.clean_depth(7).astype(np.float64)
+    points = mottled.camera.rays() * depth_m[..., None]
+    T = mottled.pose(7)
+    expected = a.color * pattern(points @ T[:3, :3].T + T[:3, 3], depth_m / mottled.camera.fx)[..., None]
+    assert np.abs(b.color - np.clip(expected, 0, 255)).max() <= 1.0
+    assert (a.color != b.color).any(axis=-1).mean() > 0.8
+
+
+VARIANTS = range(4)
+coordinate = st.floats(-2, 2)
+HERE, THERE = Place(1.0, 2.0), Place(3.0, 2.0, 0.5, math.pi)
+
+
+def inside(solids: tuple[Solid, ...]) -> NDArray[np.float64]:
+    """Points spread in some solids, at least 2 cm or half their thickness deep."""
+    random = np.random.default_rng(0)
+    points = []
+    for solid in solids:
+        half = np.maximum(np.array(solid.half_size) - 0.02, 0.5 * np.array(solid.half_size))
+        if solid.kind != "box":
+            half[:2] *= math.sqrt(0.5)  # the square within the circle
+        if solid.kind == "sphere":
+            half *= 0.8
+        local = random.uniform(-1, 1, (150, 3)) * half
+        c, s = math.cos(solid.yaw), math.sin(solid.yaw)
+        points.append(solid.center + local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
+    return np.concatenate(points)
+
+
+@given(
+    coordinate,
+    coordinate,
+    coordinate,
+    st.floats(-4, 4),
+    st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1),
+)
+def test_a_placed_solid_is_the_same_solid_elsewhere(
+    x: float, y: float, z: float, yaw: float, points: list[tuple[float, float, float]]
+) -> None:
+    solid = Solid("box", (0.3, -0.2, 0.5), (0.4, 0.2, 0.1), 0.7)
+    c, s = math.cos(yaw), math.sin(yaw)
+    moved = np.array(points) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (x, y, z)
+    there = distance_to_solids(placed([solid], Place(x, y, z, yaw)), moved)
+    np.testing.assert_allclose(there, distance_to(solid, np.array(points)), atol=1e-9)
+
+
+def test_a_thing_is_where_its_stays_say() -> None:
+    ball = Solid("sphere", (0, 0, 1), (0.1, 0.1, 0.1))
+    thing = Thing("ball", (ball,), (Stay(2.0, 8.0, HERE, HERE), Stay(10.0, 12.0, HERE, THERE)))
+    assert [bool(thing.solids_at(t)) for t in (0.0, 2.0, 7.9, 8.0, 9.9, 10.0, 12.0)] == [
+        False, True, True, False, False, True, False,
+    ]  # fmt: skip
+    (halfway,) = thing.solids_at(11.0)
+    np.testing.assert_allclose(halfway.center, (2.0, 2.0, 1.25))
+    assert halfway.yaw == pytest.approx(math.pi / 2)
+    assert [stay.stands for stay in thing.stays] == [True, False]
+    assert not thing.walks
+    (moved,) = thing.moved_by((1.0, 0.0, -1.0)).solids_at(2.0)
+    np.testing.assert_allclose(moved.center, (2.0, 2.0, 0.0))
+
+
+def test_a_way_takes_as_long_as_its_length() -> None:
+    first, second = way(3.0, 0.5, [(0, 0), (2, 0), (2, 1)])
+    assert (first.start_s, first.end_s, second.end_s) == (3.0, 7.0, 9.0)
+    assert first.place(5.0) == Place(1.0, 0.0)
+    assert second.begin.yaw == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_camera_keeps_clear(script: str, variant: int) -> None:
+    scene = moving_room(script, variant)
+    for stamp in np.arange(0, 2 * PERIOD_S, 1.0):
+        eye = scene.camera.pose(stamp)[:3, 3]
+        assert scene.at(stamp).signed_distance(eye)[0] > 0.4, stamp  # the least depth of a Kinect
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_things_pass_through_nothing(script: str, variant: int) -> None:
+    scene = moving_room(script, variant)
+    for stamp in np.arange(0, PERIOD_S, 1.7):
+        for thing in scene.things:
+            solids = thing.solids_at(stamp)
+            if not solids:
+                continue
+            within = inside(solids)
+            assert distance_to_solids(solids, within).max() < -0.005
+            assert scene.static.signed_distance(within).min() > 0, (stamp, thing.name)
+            others = [s for other in scene.things if other is not thing for s in other.solids_at(stamp)]
+            assert distance_to_solids(others, within).min() > 0, (stamp, thing.name)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_repeats_itself_and_another_variant_is_another_scene(script: str) -> None:
+    scene, other = moving_room(script), moving_room(script, 1)
+    stamps = np.arange(0.5, PERIOD_S, 1.0)
+    assert all(scene.at(t) == scene.at(t + PERIOD_S) for t in stamps)
+    assert any(scene.at(t) != other.at(t) for t in stamps)
+    assert len({scene.at(t).solids for t in stamps}) > 1
+
+
+def test_the_door_opens_onto_a_room_and_closes() -> None:
+    scene = moving_room("door")
+    (door,) = scene.things
+    middle = placed(door.solids[:1], door.stays[0].begin)[0].center
+    behind = (middle[0], middle[1] - 0.8, middle[2])
+    shut, wide, again = (scene.at(t).signed_distance([middle, behind]) for t in (5.0, 30.0, 55.0))
+    assert shut[0] < 0 < wide[0] - 0.3
+    assert again[0] == shut[0]
+    assert min(shut[1], wide[1], again[1]) > 0.3
+
+
+def test_frames_show_what_is_there_at_their_time(one_backend: str) -> None:
+    room = open_dataset("synthetic:room?moving=things&frames=40&width=80&height=60&noise=none", color=False)
+    scene = room.moving_scene
+    ball = scene.things[0]
+    shown = []
+    for index in (15, 25):
+        frame = room.read(index)
+        assert frame.stamp == index
+        np.testing.assert_array_equal(frame.T_world_camera, scene.camera.pose(index))
+        np.testing.assert_array_equal(frame.depth_m, room.clean_depth(index))
+        points = room.camera.rays() * frame.depth_m[..., None].astype(np.float64)
+        points = points.reshape(-1, 3) @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+        assert np.abs(scene.at(index).signed_distance(points)).max() < 1e-4
+        shown.append((np.abs(distance_to_solids(ball.solids_at(25), points)) < 1e-4).sum())
+    assert shown[0] == 0
+    assert shown[1] > 50

@@ -1,11 +1,15 @@
 """Every example runs as it stands, and says what it is meant to show."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
+
+from taichi_mrf.session import own_loop
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("[0-9]*.py"))
 
@@ -75,3 +79,28 @@ def test_comparing_methods(tmp_path: Path) -> None:
     }
     baselines = (rows["OctoMap-style log-odds"][1], rows["visibility map"][1])
     assert rows["MRFMap"][1] > max(baselines)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_notebook(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(own_loop, "_in_notebook", lambda: True)
+    plt.switch_backend("agg")
+    cells = json.loads((EXAMPLES[0].parent / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert not cell["outputs"]
+            exec("".join(cell["source"]), names)
+    plt.close("all")
+    printed = capsys.readouterr().out
+    assert "10 keyframes:" in printed
+    assert int(re.findall(r"([0-9]+)% of the pixels right", printed)[0]) > 75
+    assert (tmp_path / "room.npz").exists()
+
+
+def test_every_example_is_in_the_index() -> None:
+    index = (EXAMPLES[0].parent / "README.md").read_text(encoding="utf-8")
+    assert not [path.name for path in EXAMPLES if f"({path.name})" not in index]

@@ -34,7 +34,6 @@ from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32Array
 from taichi_mrf.methods.log_odds.map import LogOddsMap
-from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -128,9 +127,7 @@ def test_both_kinds_of_rays_of_a_keyframe_equal_the_numpy_schedule(
     made_by = ExactMapWithLengths if lengths else ExactMap
     inference = InferenceConfig(sweeps=sweeps, outlier_floor=FLOOR, free_share=0.0)
     m = made_by.from_config(Config(voxel_size=VOXEL, sensor=MODEL, inference=inference), camera)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keyframe_allocator, "SCOUTS", 1)
-        m.add_keyframe(depth, T, camera, no_return=missing)
+    m.add_keyframe(depth, T, camera, no_return=missing)
     rays = reference.cast(depth, T, camera, VOXEL, Noise(MODEL.sigma), MODEL.max_depth)
     without = unreturned(T, camera, law_of(MODEL))
     # What measured rays of the keyframe cross is not told by missing ones.

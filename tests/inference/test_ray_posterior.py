@@ -14,7 +14,6 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.kernels.types import F32, I32, F32Array, Template
-from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -100,9 +99,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass
     m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=MAX_DEPTH)
     T = look_along(rng.uniform(-1, 1, 3), rng.normal(size=3), rng)
     depth = rng.uniform(0.5, 0.8, CAMERA.shape).astype(np.float32)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keyframe_allocator, "SCOUTS", 1)
-        m.add_keyframe(depth, T, CAMERA)
+    m.add_keyframe(depth, T, CAMERA)
     m.infer()
     rays = reference.cast(depth, T, CAMERA, VOXEL, Noise((sigma,)), max_depth=MAX_DEPTH)
     assume(well_cut(rays[::2], 99))

@@ -25,7 +25,6 @@ from benchmarks.speed.profile import count_launches
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import content_key
-from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -143,10 +142,7 @@ def test_loops_equal_the_numpy_schedule(
         direction /= np.linalg.norm(direction)
         T = look_along(middle - 0.6 * direction, direction, rng)
         depth = rng.uniform(0.5, 0.8, camera.shape).astype(np.float32)
-        with pytest.MonkeyPatch.context() as patch:
-            # Rays of so small an image are no neighbours: each may cross bricks that no other one does.
-            patch.setattr(keyframe_allocator, "SCOUTS", 1)
-            id = m.add_keyframe(depth, T, camera)
+        id = m.add_keyframe(depth, T, camera)
         if alone or pixels == (1, 1):
             rays[id] = reference.cast(depth, T, camera, VOXEL, sensor, max_depth=1.5)
         else:

@@ -12,7 +12,7 @@ from uncertain_wall import WALL_M, uncertain_wall
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.surface_votes import CALLED, GRAZED
-from taichi_mrf.methods.mrf import decided, keyframe_allocator
+from taichi_mrf.methods.mrf import decided
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.map_reading import MapReading
 from taichi_mrf.queries.cast import cast_rays
@@ -63,9 +63,7 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
         direction = rng.normal(size=3)
         T = look_along(middle - 0.6 * direction / np.linalg.norm(direction), direction, rng)
         depth = rng.uniform(0.5, 0.7, camera.shape).astype(np.float32)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(keyframe_allocator, "SCOUTS", 1)
-            m.add_keyframe(depth, T, camera)
+        m.add_keyframe(depth, T, camera)
         rays += reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), max_depth=1.5)
     m.infer()
     voxels = sorted(allocated(m))

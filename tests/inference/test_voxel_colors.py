@@ -16,7 +16,6 @@ from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.color_sums import WEIGHT_STEPS, ColorShare
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.log_odds.map import LogOddsMap
-from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -65,9 +64,7 @@ def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float)
         depth = rng.uniform(0.55, 0.65, camera.shape).astype(np.float32)
         color = rng.integers(1, 256, (2, 2, 3)).astype(np.uint8)
         color[0, 0] = 0  # a pixel without a colour
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(keyframe_allocator, "SCOUTS", 1)
-            id = m.add_keyframe(depth, T, camera, color=color)
+        id = m.add_keyframe(depth, T, camera, color=color)
         rays[id] = reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), max_depth=1.5)
         images[id] = color.reshape(-1, 3).astype(float)
     assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))

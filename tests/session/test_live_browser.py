@@ -121,6 +121,8 @@ def test_the_threshold_moves_the_count(page: LivePage, saved: MRFMap) -> None:
         most, fewest = (voxels_of(saved, p) for p in odds / (1 + odds))
         assert fewest <= seen.voxels <= most
         before = seen
+    page.page.get_by_text("Threshold", exact=True).hover()
+    page.until(lambda seen: "Show voxels whose probability" in page.text(), "the label's tooltip")
     page.nudge("Threshold", "ArrowRight")
     page.until(lambda seen: seen.agrees and seen.voxels < before.voxels, "fewer voxels")
     page.slide("Threshold", 0.5)
@@ -147,7 +149,7 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
     for mode, legend in [
-        ("marginal", "probability"),
+        ("probability", "probability"),
         ("uncertainty", "bits"),
         ("keyframes", "see the voxel"),
     ]:
@@ -168,12 +170,16 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
     half = page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
     page.screenshot("cut_z")
-    page.slide("Cut at", 0.3)
+    page.slide("Cut at (m)", -0.7)
     lower = page.until(lambda seen: seen.agrees and 0 < seen.voxels < half.voxels, "fewer still")
     page.select("Cut axis", "x")
     page.until(lambda seen: seen.agrees and seen.voxels not in (0, lower.voxels), "another cut")
     page.screenshot("cut_x")
-    page.slide("Cut at", 0.5)
+    seen = page.look()
+    page.tick("Flip cut")
+    page.until(lambda other: other.agrees and other.voxels + seen.voxels > before.voxels, "the other side")
+    page.screenshot("cut_flipped")
+    page.tick("Flip cut", on=False)
     page.select("Cut axis", "none")
     after = page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
     assert "/cut" not in after.nodes
@@ -204,11 +210,18 @@ def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
 
 def test_dark_and_light(page: LivePage) -> None:
     for dark in (True, False):
-        page.tick("Dark", on=dark)
+        page.page.emulate_media(color_scheme="dark" if dark else "light")
         scheme = "dark" if dark else "light"
         page.page.wait_for_selector(f'html[data-mantine-color-scheme="{scheme}"]', state="attached")
         corner = cv2.imread(str(page.screenshot(scheme)))[-40:, :40]
         assert 60 < corner.mean() < 160  # neither white nor black things merge with the background
+    page.press("Dark or light")  # a user's choice, which the browser keeps
+    page.page.wait_for_selector('html[data-mantine-color-scheme="dark"]', state="attached")
+    page.page.reload()
+    page.page.wait_for_selector('html[data-mantine-color-scheme="dark"]', state="attached")
+    page.until_settled()
+    page.press("Dark or light")
+    page.page.wait_for_selector('html[data-mantine-color-scheme="light"]', state="attached")
 
 
 def wait_for_the_plot(page: LivePage) -> str:
@@ -259,6 +272,17 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     page.until(
         lambda seen: "/distance" not in seen.nodes and "from the last click" not in page.text(), "no answer"
     )
+    page.page.keyboard.down("Shift")
+    page.page.mouse.move(x - 40, y - 40)
+    page.page.mouse.down()
+    page.page.mouse.move(x + 40, y + 40, steps=4)
+    page.page.mouse.up()
+    page.page.keyboard.up("Shift")
+    page.until(lambda seen: votes.count() >= 1, "what keyframes say of the voxels in the rectangle")
+    sizes_m = re.search(r"size x, y, z \(m\)\s+(\S+) x (\S+) x (\S+)", page.text()).groups()
+    assert 0.1 < max(map(float, sizes_m)) < 4.0
+    page.screenshot("rectangle")
+    page.press("Close")
     text = wait_for_the_plot(page)
     assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
 
@@ -338,10 +362,15 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
 ) -> None:
     before = page.look()
     with LivePage(browser, program.address, width=400, height=700) as narrow:
+        assert not narrow.input("Show").is_visible()  # the panel is folded at first
+        narrow.until(lambda seen: seen.voxels == before.voxels, "the voxels")
+        places = np.array(narrow.places("/voxels/", "points"))[:, :2]
+        assert ((places > 0) & (places < (400, 700))).all()
+        narrow.page.get_by_text("taichi_mrf", exact=True).click()
         assert narrow.until_settled().voxels == before.voxels
         narrow.screenshot("narrow")
         assert narrow.page.evaluate("() => document.documentElement.scrollWidth") <= 400
-        for label in ("Threshold", "Color by", "Cut at"):
+        for label in ("Threshold", "Color by", "Size"):
             widget = narrow.input(label)
             widget.scroll_into_view_if_needed()
             box = widget.bounding_box()

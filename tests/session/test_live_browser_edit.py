@@ -248,20 +248,23 @@ def drag(page: LivePage, start: np.ndarray, end: np.ndarray) -> None:
 
 def test_the_saved_map_is_the_one_that_is_shown(page: LivePage, tmp_path: Path, out: Path) -> None:
     shown = at_rest(page)
+    page.tab("Save")
+    assert "The map has changes that are not saved" in page.text()
     assert len(page.saved_map(tmp_path).decided.voxels(0.5)[0]) == shown.voxels
     assert (out / "map.npz").read_bytes() == (tmp_path / "saved.npz").read_bytes()
+    page.until(lambda seen: "not saved" not in page.text(), "nothing unsaved")
 
 
 def test_the_voxels_open_as_ply(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
-    page.download("Voxels").save_as(tmp_path / "voxels.ply")
+    page.download("Voxels (.ply)").save_as(tmp_path / "voxels.ply")
     cloud = trimesh.load(tmp_path / "voxels.ply")
     page.until(lambda seen: seen.voxels == len(cloud.vertices), "the voxels of the file")
 
 
 def test_the_picture_shows_the_map(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
-    page.download("Picture").save_as(tmp_path / "view.png")
+    page.download("Picture (.png)").save_as(tmp_path / "view.png")
     picture = cv2.imread(str(tmp_path / "view.png"))
     assert picture.shape[0] > 300
     assert picture.shape[1] > 300
@@ -270,7 +273,7 @@ def test_the_picture_shows_the_map(page: LivePage, tmp_path: Path) -> None:
 
 def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", tmp_path: Path) -> None:
     page.tab("Save")
-    page.download("Page").save_as(tmp_path / "map.html")
+    page.download("Page (.html)").save_as(tmp_path / "map.html")
     with LivePage(browser, (tmp_path / "map.html").as_uri()) as standalone:
         shown = page.look()
         standalone.until(lambda seen: seen.voxels == shown.voxels, "the map without a server")
@@ -281,7 +284,7 @@ def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", t
 
 def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
-    page.press("Recording")
+    page.press("Recording (.viser)")
     page.pause(1.0)
     page.tab("Map")
     before = page.look()
@@ -290,7 +293,7 @@ def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None
     page.slide("Threshold", 0.5)
     page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
     page.tab("Save")
-    page.download("Recording").save_as(tmp_path / "map.viser")
+    page.download("Recording (.viser)").save_as(tmp_path / "map.viser")
     content = zstandard.ZstdDecompressor().decompress((tmp_path / "map.viser").read_bytes()[8:])
     (length,) = struct.unpack("<Q", content[:8])
     recording = msgspec.msgpack.decode(content[8 : 8 + length])

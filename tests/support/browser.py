@@ -290,7 +290,7 @@ class LivePage:
         """The map as the page's button saves it now; the tab Save is left open."""
         path = folder / "saved.npz"
         self.tab("Save")
-        self.download("Map").save_as(path)
+        self.download("Map (.npz)").save_as(path)
         runtime.init("cpu")
         return MRFMap.load(path)
 

@@ -2,9 +2,10 @@
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,6 +71,12 @@ def stamped_line(stamp: float, pose: Pose) -> str:
     """stamp tx ty tz qx qy qz qw."""
     numbers = (stamp, *pose[:3, 3], *quaternion_of(pose[:3, :3]))
     return " ".join(repr(float(number)) for number in numbers)
+
+
+def write_stamped(path: Path, stamps: Iterable[float], poses: Iterable[Pose]) -> Path:
+    """A file of stamped poses."""
+    path.write_text("\n".join(map(stamped_line, stamps, poses)) + "\n")
+    return path
 
 
 def write_seven_scenes(folder: Path, content: Content) -> Path:
@@ -197,13 +204,14 @@ def write_record3d(
     return path
 
 
-def write_replica(folder: Path, content: Content, parameters: Path) -> Path:
+def write_replica(folder: Path, content: Content, place: str = "..") -> Path:
+    """Its camera lies above the folder, or at another place from there."""
     for i in range(content.count):
         write_image(folder / f"results/depth{i:06d}.png", content.depth[i])
         write_image(folder / f"results/frame{i:06d}.png", content.color[i])
     (folder / "traj.txt").write_text("\n".join(row_of(pose) for pose in content.poses))
     camera = {"w": 16, "h": 12, "fx": 14.0, "fy": 15.0, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
-    parameters.write_text(json.dumps({"camera": camera}))
+    (folder / place / "cam_params.json").write_text(json.dumps({"camera": camera}))
     return folder
 
 
@@ -252,12 +260,25 @@ def write_house(folder: Path, content: Content) -> Path:
     return folder
 
 
-FORMATS = {  # writer, steps per metre, whether colour is written
-    "seven_scenes": (write_seven_scenes, 1000.0, True),
-    "tum": (write_tum, 5000.0, True),
-    "redwood": (write_redwood, 1000.0, True),
-    "icl": (write_icl, 5000.0, False),
-    "house": (write_house, 5000.0, False),
+class Format(NamedTuple):
+    """A writer of a folder, and what is read of it if nothing is said: steps per metre, whether colours come,
+    and the seconds of the first stamp and from one to the next."""
+
+    write: Callable[[Path, Content], Path]
+    steps: float
+    colored: bool
+    first_s: float
+    step_s: float
+
+
+FORMATS = {
+    "seven_scenes": Format(write_seven_scenes, 1000.0, True, 0.0, 10 / 30),
+    "tum": Format(write_tum, 5000.0, True, 1305031102.0, 0.033),
+    "redwood": Format(write_redwood, 1000.0, True, 0.0, 1 / 30),
+    "icl": Format(write_icl, 5000.0, False, 1 / 30, 1 / 30),
+    "house": Format(write_house, 5000.0, False, 180.0, 1.0),  # nobody knows when: a second apart
+    "scannet": Format(write_scannet, 1000.0, False, 0.0, 5 / 30),
+    "replica": Format(write_replica, 6553.5, True, 0.0, 1 / 30),
 }
 
 

@@ -12,8 +12,6 @@ from datasets_recordings import (
     arrays,
     write_npz,
     write_record3d,
-    write_replica,
-    write_scannet,
     write_stray,
 )
 from inputs_bags import writing
@@ -43,9 +41,7 @@ def write_bag(packed: bool, folder: Path, content: Content) -> Path:
 
 
 WHOLE_NUMBERS: dict[str, Callable[[Path, Content], Path]] = {
-    **{name: writer for name, (writer, _, _) in FORMATS.items()},
-    "scannet": write_scannet,
-    "replica": lambda folder, content: write_replica(folder, content, folder.parent / "cam_params.json"),
+    **{name: each.write for name, each in FORMATS.items()},
     "npz": write_steps,
     "bag": partial(write_bag, False),
     "bag, packed": partial(write_bag, True),

@@ -498,7 +498,7 @@ LOADERS = [
     Loader("ICL-NUIM .freiburg", _icl, _dataset),
     Loader("Open3D JSON", _open3d, _dataset),
     Loader("ScanNet", _of(write_scannet), _dataset),
-    Loader("Replica", lambda folder: write_replica(folder, CONTENT, folder / "cam_params.json"), _dataset),
+    Loader("Replica", lambda folder: write_replica(folder, CONTENT, "."), _dataset),
     Loader("Stray Scanner", _of(write_stray), _dataset),
     Loader("Record3D", _record3d, _dataset),
     Loader("Record3D .r3d", _of(write_record3d, "walk.r3d"), _dataset),

@@ -1,7 +1,7 @@
 """Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +20,10 @@ from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
 Kind = Literal["ros1", "sqlite", "mcap"]
+Make = Callable[..., Path]
+"""Writes a bag of parts, as the fixture ``make`` does; returns its path."""
+
+EYE = np.eye(4)
 START = 1_600_000_000.0
 """Seconds of the first stamps."""
 
@@ -82,6 +86,13 @@ class Bag:
             step=padded.shape[1],
             data=padded.reshape(-1),
         )
+
+    def compressed(self, topic: str, stamp: float, frame: str, image: NDArray, words: str) -> None:
+        """A CompressedImage of a file; ``words`` is its format. Three channels are RGB."""
+        suffix = ".jpg" if "jpeg" in words else ".png"
+        data = cv2.imencode(suffix, image[..., ::-1] if image.ndim == 3 else image)[1].reshape(-1)
+        name = "sensor_msgs/msg/CompressedImage"
+        self.send(topic, name, stamp, header=self.header(stamp, frame), format=words, data=data)
 
     def compressed_depth(
         self,
@@ -156,16 +167,18 @@ class Bag:
             **arrays,
         )
 
+    def vector(self, values: Iterable[float], name: str = "Vector3") -> Any:
+        return self.message(f"geometry_msgs/msg/{name}", **dict(zip("xyz", values, strict=True)))
+
+    def quaternion(self, values: Iterable[float]) -> Any:
+        return self.message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
+
     def pose(self, T: Pose) -> Any:
-        x, y, z, w = quaternion_of(T[:3, :3])
-        return self.message(
-            "geometry_msgs/msg/Pose",
-            position=self.message("geometry_msgs/msg/Point", **dict(zip("xyz", T[:3, 3], strict=True))),
-            orientation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
+        place, turn = self.vector(T[:3, 3], "Point"), self.quaternion(quaternion_of(T[:3, :3]))
+        return self.message("geometry_msgs/msg/Pose", position=place, orientation=turn)
 
     def odometry(self, topic: str, stamp: float, frame: str, child: str, T: Pose) -> None:
-        zero = self.message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        zero = self.vector([0.0, 0.0, 0.0])
         twist = self.message("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         self.send(
             topic,
@@ -190,18 +203,14 @@ class Bag:
         self.send(topic, "nav_msgs/msg/Path", stamp, header=self.header(stamp, frame), poses=each)
 
     def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
-        x, y, z, w = quaternion_of(T[:3, :3])
+        """A transform; of a matrix of zeros, with a quaternion of zeros."""
+        turn = quaternion_of(T[:3, :3]) if T[:3, :3].any() else np.zeros(4)
+        place = {"translation": self.vector(T[:3, 3]), "rotation": self.quaternion(turn)}
         transform = self.message(
             "geometry_msgs/msg/TransformStamped",
             header=self.header(stamp, parent),
             child_frame_id=child,
-            transform=self.message(
-                "geometry_msgs/msg/Transform",
-                translation=self.message(
-                    "geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))
-                ),
-                rotation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-            ),
+            transform=self.message("geometry_msgs/msg/Transform", **place),
         )
         self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[transform])
 
@@ -265,6 +274,7 @@ def write_bag(folder: Path, *parts: Callable[[Bag], object], kind: Kind = "ros1"
 COUNT = 5
 FRAME = "camera_depth_optical_frame"
 BODY = "base_link"
+TOPIC, INFO = "/camera/depth/image_raw", "/camera/depth/camera_info"
 T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
 
 
@@ -274,28 +284,73 @@ def steps(i: int) -> np.ndarray:
     return image
 
 
-def world_body(i: int) -> Pose:
+def world_body(i: float) -> Pose:
     return look_at([0.1 * i, 0.2, 0.0], [3.0, 0.1 * i, 0.2])
 
 
-def stamp(i: int) -> float:
+def stamp(i: float) -> float:
     return 1.0 + 0.1 * i
 
 
-def images(bag: Bag, topic: str = "/camera/depth/image_raw", info: bool = True) -> None:
+def images(
+    bag: Bag,
+    topic: str = TOPIC,
+    info: bool = True,
+    frame: str = FRAME,
+    image: Callable[[int], NDArray] = steps,
+    encoding: str = "16UC1",
+    late: float = 0.0,
+    numbers: Sequence[int] = range(COUNT),
+) -> None:
+    """Images, with the CameraInfo that goes with their topic."""
     if info:
-        bag.camera_info(topic.rpartition("/")[0] + "/camera_info", FRAME, CAMERA)
+        bag.camera_info(topic.rpartition("/")[0] + "/camera_info", frame, CAMERA)
+    for i in numbers:
+        bag.image(topic, stamp(i) + late, frame, image(i), encoding)
+
+
+def odometry(
+    bag: Bag,
+    topic: str = "/odom",
+    child: str = BODY,
+    T: Pose = EYE,
+    late: float = 0.0,
+    numbers: Sequence[float] = range(COUNT),
+) -> None:
+    """The way of a body that starts at T, as Odometry."""
+    for i in numbers:
+        bag.odometry(topic, stamp(i) + late, "odom", child, T @ world_body(i))
+
+
+def moving_tf(
+    bag: Bag,
+    parent: str = "odom",
+    T: Pose = EYE,
+    child: str = BODY,
+    topic: str = "/tf",
+    late: float = 0.0,
+    numbers: Sequence[float] = range(COUNT),
+) -> None:
+    """The way of a body that starts at T, as transforms."""
+    for i in numbers:
+        bag.tf(topic, stamp(i) + late, parent, child, T @ world_body(i))
+
+
+def stamped_poses(bag: Bag, topic: str, frame: str = "map", T_body_own: Pose = EYE) -> None:
+    """The way of something on the body, as PoseStamped, which names no body."""
     for i in range(COUNT):
-        bag.image(topic, stamp(i), FRAME, steps(i), "16UC1")
+        bag.pose_stamped(topic, stamp(i), frame, world_body(i) @ T_body_own)
 
 
-def odometry(bag: Bag, topic: str = "/odom", child: str = BODY) -> None:
-    for i in range(COUNT):
-        bag.odometry(topic, stamp(i), "odom", child, world_body(i))
-
-
-def mounted(bag: Bag) -> None:
-    bag.tf("/tf_static", 0.0, BODY, FRAME, T_body_camera)
+def mounted(
+    bag: Bag,
+    parent: str = BODY,
+    child: str = FRAME,
+    T: Pose = T_body_camera,
+    topic: str = "/tf_static",
+) -> None:
+    """A transform that is fixed: where the camera is on the body."""
+    bag.tf(topic, 0.0, parent, child, T)
 
 
 def plain(bag: Bag) -> None:
@@ -305,10 +360,14 @@ def plain(bag: Bag) -> None:
 
 
 def check_poses(
-    dataset: Dataset, T_fixed: Pose | None = None, mount: Pose = T_body_camera, count: int = COUNT
+    dataset: Dataset, T_fixed: Pose = EYE, mount: Pose = T_body_camera, count: int = COUNT
 ) -> None:
     """Its frames are at the body's poses, seen from a fixed frame, and mounted so."""
     assert len(dataset) == count
     for i, frame in enumerate(dataset):
-        T = (np.eye(4) if T_fixed is None else T_fixed) @ world_body(i) @ mount
-        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)
+        np.testing.assert_allclose(frame.T_world_camera, T_fixed @ world_body(i) @ mount, atol=1e-9)
+
+
+def data_file(path: Path) -> Path:
+    """The file of a bag that holds its messages."""
+    return path if path.is_file() else next(path.glob("*.[dm][bc]*"))

@@ -30,6 +30,12 @@ class Walk:
         self.poses = [look_at([0.3 * i, 0.1, 1.0], [3.0, 0.2 * i, 1.2]) for i in range(self.count)]
 
 
+def in_order(points: Points) -> Points:
+    """Points (..., 3) as (N, 3), in an order that does not depend on theirs."""
+    flat = np.asarray(points, np.float64).reshape(-1, 3)
+    return flat[np.lexsort(flat.T)]
+
+
 def lzf(data: bytes) -> bytes:
     """Pack bytes as libLZF does: repeats of three bytes and more, found by the last place of each triple."""
     out, literals, last, at = bytearray(), bytearray(), {}, 0

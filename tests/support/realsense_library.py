@@ -1,8 +1,9 @@
-"""A stand-in for Intel's RealSense library: what cameras and their recordings have in common, and a motion
+"""A stand-in for Intel's RealSense library: cameras and recordings that play the same images, and a motion
 sensor, a gyroscope and an accelerometer that are turned against the depth camera."""
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -28,24 +29,123 @@ STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 """The depth image of a camera of 4 x 3 pixels, in steps of half a millimetre."""
 
 
-def installed(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
-    """A pyrealsense2 with these names and the ones that tell kinds apart."""
+COUNT = 6
+FIRST = 1000.0
+"""Seconds of the first image; they come at 10 Hz."""
+
+
+def stamp(i: int) -> float:
+    return FIRST + 0.1 * i
+
+
+def colors(i: int) -> np.ndarray:
+    return np.arange(i, i + 36, dtype=np.uint8).reshape(3, 4, 3)
+
+
+class Pipeline:
+    """Plays ``images`` of depth in steps, or None for one that does not come, with a gap for the ``lost``.
+
+    A recording in real time loses the first image on every second start.
+    """
+
+    images: tuple[np.ndarray | None, ...] = tuple(STEPS + 10 * i for i in range(COUNT))
+    lost: tuple[int, ...] = ()
+    colored = False
+    problem: str | None = None
+    motion: "MotionSensor | None" = None
+    asked: dict[str, tuple[object, ...]]
+    starts = 0
+    stopped = 0
+
+    def start(self, config: "Config") -> SimpleNamespace:
+        if self.problem:
+            raise RuntimeError(self.problem)
+        if config.file is not None and not Path(config.file).read_bytes().startswith(b"#ROSBAG"):
+            raise RuntimeError("Failed to resolve request.\n Request to enable_device_from_file was invalid")
+        if "color" in config.streams and not self.colored:
+            raise RuntimeError("Couldn't resolve requests")
+        type(self).starts += 1
+        type(self).asked = config.streams
+        self.left = [i for i in range(len(self.images)) if i not in self.lost]
+        if config.playback is not None and config.playback.real_time and self.starts % 2 == 0:
+            self.left.pop(0)
+        return config.profile([] if config.file else sensors(self.motion))
+
+    def wait_for_frames(self, timeout_ms: int) -> SimpleNamespace:
+        i = self.left.pop(0) if self.left else None
+        if i is None or self.images[i] is None:
+            raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
+        image = depth_image(self.images[i], stamp(i), 100 + i)
+        return SimpleNamespace(get_depth_frame=lambda: image, number=i, colors=colors(i))
+
+    def stop(self) -> None:
+        type(self).stopped += 1
+
+
+class Config:
+    def __init__(self) -> None:
+        self.file: str | None = None
+        self.playback: SimpleNamespace | None = None
+        self.streams: dict[str, tuple[object, ...]] = {}
+
+    def enable_device_from_file(self, file: str, repeat_playback: bool) -> None:
+        assert not repeat_playback
+        self.file, self.playback = file, SimpleNamespace(real_time=True)
+
+    def enable_stream(self, kind: str, *asked: object) -> None:
+        self.streams[kind] = asked
+
+    def resolve(self, wrapped: object) -> SimpleNamespace:
+        return self.profile([])
+
+    def profile(self, sensors: list[object]) -> SimpleNamespace:
+        """What a pipeline gives as it starts: images of 4 x 3 pixels, whatever is asked for."""
+        intrinsics = SimpleNamespace(width=4, height=3, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
+        video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
+        depth = SimpleNamespace(get_depth_scale=lambda: 0.0005)
+        player = SimpleNamespace(set_real_time=lambda on: setattr(self.playback, "real_time", on))
+        device = SimpleNamespace(
+            first_depth_sensor=lambda: depth, as_playback=lambda: player, query_sensors=lambda: sensors
+        )
+        stream = SimpleNamespace(as_video_stream_profile=lambda: video)
+        return SimpleNamespace(get_stream=lambda kind: stream, get_device=lambda: device)
+
+
+class Context:
+    """Loads a recording with the sensors of a kind of pipeline; the motion sensor ends it."""
+
+    def __init__(self, pipeline: type[Pipeline]) -> None:
+        self.motion = pipeline.motion
+
+    def load_device(self, file: str) -> SimpleNamespace:
+        assert Path(file).is_file()
+        motion = self.motion or SimpleNamespace()
+        return SimpleNamespace(
+            set_real_time=lambda on: setattr(motion, "real_time", on),
+            set_status_changed_callback=lambda changed: setattr(motion, "then", lambda: changed("stopped")),
+            query_sensors=lambda: sensors(self.motion),
+        )
+
+
+def installed(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
+    """A pyrealsense2 whose pipelines are of the returned class, a new one."""
+
+    class TestPipeline(Pipeline):
+        pass
+
     module = ModuleType("pyrealsense2")
-    streams = SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel")
-    formats = SimpleNamespace(z16="z16", rgb8="rgb8")
-    module.__dict__.update(stream=streams, format=formats, align=Align, **names)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
-
-
-def profile_of(width: int = 4, height: int = 3, **of_device: object) -> SimpleNamespace:
-    """What a pipeline gives as it starts."""
-    intrinsics = SimpleNamespace(width=width, height=height, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
-    video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
-    sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
-    return SimpleNamespace(
-        get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
-        get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, **of_device),
+    module.__dict__.update(
+        stream=SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel"),
+        format=SimpleNamespace(z16="z16", rgb8="rgb8"),
+        align=Align,
+        pipeline=TestPipeline,
+        config=Config,
+        pipeline_wrapper=lambda pipeline: pipeline,
+        context=lambda: Context(TestPipeline),
+        playback_status=SimpleNamespace(stopped="stopped"),
     )
+    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+    return TestPipeline
 
 
 def depth_image(steps: np.ndarray, stamp_s: float, number: int) -> SimpleNamespace:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 
 
@@ -27,4 +27,12 @@ def refused(source: str | Path, *words: str, **options: Any) -> str:
     with refusal(DatasetError, *words) as caught:
         open_dataset(source, **options)
     assert not isinstance(caught.value, FrameError)
+    return str(caught.value)
+
+
+def bad_frame(dataset: Dataset, index: int, *words: str) -> str:
+    """What is said of a frame that cannot be read: one line with these words, begun with its name."""
+    with refusal(FrameError, *words) as caught:
+        dataset.read(index)
+    assert str(caught.value).startswith(f"frame {dataset.frame_names[index]}: ")
     return str(caught.value)

@@ -77,9 +77,9 @@ def test_a_cell_is_as_large_as_the_surface_is_uncertain(
 
 def test_a_cell_has_the_colour_of_its_own_probability() -> None:
     store = store_of(wall(2, -0.5))
-    (color,) = set(boxes(store, color_by="marginal").values())
+    (color,) = set(boxes(store, color_by="probability").values())
     p = 2 / (1 + np.exp(0.5))
-    scale = look_of(ViewOptions(color_by="marginal"), store, (2, 1), VOXEL).scale
+    scale = look_of(ViewOptions(color_by="probability"), store, (2, 1), VOXEL).scale
     expected = scale.colors[round(255 * (p - 0.5) / 0.5)]
     assert np.abs(np.array(color, int) - expected).max() <= 3
 

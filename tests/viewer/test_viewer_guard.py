@@ -196,9 +196,8 @@ def test_clicks_arrive_with_unit_directions(guarded: GuardedPage, stranger: RawC
         click("/box", screen_pos=["a", "b"]),
         click("/box", instance_index=-1),
         click("/box", modifier="meta"),
-        scene_click(
-            event_type="rect-select", screen_pos=[[0, 0], [1, 1]], ray_origin=None, ray_direction=None
-        ),
+        scene_click(event_type="rect-select", screen_pos=[[0, 0], [1, 1.1]]),
+        scene_click(event_type="rect-select", screen_pos=[[0, 0]]),
         scene_click(ray_direction=None),
         scene_click(screen_pos=[]),
         scene_click(ray_origin=[1e300, 0, 0]),

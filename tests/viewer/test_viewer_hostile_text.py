@@ -197,7 +197,7 @@ def test_the_saved_page_runs_no_script_of_a_scene(browser: "Browser", tmp_path: 
     server = start_server("127.0.0.1", 0, "Saved")
     try:
         server.scene.add_point_cloud("/voxels/0", np.zeros((3, 3), np.float32), np.zeros(3, np.uint8))
-        html = standalone_page(server.get_scene_serializer(), dark=False)
+        html = standalone_page(server.get_scene_serializer())
     finally:
         server.stop()
     foreign = HOSTILE.partition("<a href")[0] + "<script>window.ran='script'</script><b id=there></b>"

@@ -51,14 +51,14 @@ def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
 def test_marginals_have_the_colours_of_the_files_and_pictures() -> None:
     p = np.linspace(0.5, 0.9999, 200)
     log_odds = np.log(p / (1 - p))
-    colors = voxel_colors(scale_of("marginal", 0.5, HEIGHTS), shown(log_odds), np.zeros(200))
+    colors = voxel_colors(scale_of("probability", 0.5, HEIGHTS), shown(log_odds), np.zeros(200))
     # The log-odds are rounded to 1/512, which is at most one of 256 colours.
     assert np.abs(colors.astype(int) - marginal_colors(p)).max() <= 4
 
 
 def test_the_scale_reaches_down_when_improbable_voxels_are_shown() -> None:
-    assert scale_of("marginal", 0.5, HEIGHTS).low == 0.5
-    low = scale_of("marginal", 0.2, HEIGHTS)
+    assert scale_of("probability", 0.5, HEIGHTS).low == 0.5
+    low = scale_of("probability", 0.2, HEIGHTS)
     dark = voxel_colors(low, shown(np.array([-20.0])), np.zeros(1))
     np.testing.assert_array_equal(dark[0], low.colors[0])
 
@@ -127,7 +127,7 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
     large.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
-    by_marginal, by_height = ViewOptions(color_by="marginal"), ViewOptions()
+    by_marginal, by_height = ViewOptions(color_by="probability"), ViewOptions()
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
     assert look_of(by_height, small, up, 0.05) != look_of(by_height, large, up, 0.05)
@@ -292,7 +292,7 @@ def test_surfaces_are_darkened_by_the_way_they_face() -> None:
     for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True):
         missing = [sum(not grid[tuple(c)] for c in neighbours(cell, axis)) for axis in range(3)]
         assert number == (missing[0] * 3 + missing[1]) * 3 + missing[2]
-    scale = scale_of("marginal", 0.5, HEIGHTS)
+    scale = scale_of("probability", 0.5, HEIGHTS)
     bright = shown(np.full(3, 9.0))
     plain = voxel_colors(scale, bright, np.zeros(3)).astype(float)
     dark = voxel_colors(scale, bright, np.zeros(3), np.array([18, 2, 0], np.uint8)).astype(float)

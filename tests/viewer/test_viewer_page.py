@@ -141,9 +141,9 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
     colors = handled.page.panel.view_options.handles["color_by"]
-    assert list(colors.options) == ["marginal", "height", "uncertainty", "keyframes"]
+    assert list(colors.options) == ["probability", "height", "uncertainty", "keyframes"]
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
-    assert list(colors.options) == ["marginal", "height", "uncertainty", "photo"]
+    assert list(colors.options) == ["probability", "height", "uncertainty", "photo"]
 
 
 def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClient) -> None:
@@ -251,17 +251,17 @@ def test_a_browser_that_sends_no_picture_keeps_nobody_waiting(
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
     silent = handled.client_id()
     for _ in range(6):
-        handled.act("Picture", silent)
+        handled.act("Picture (.png)", silent)
     browser.hear_type("GetRenderRequestMessage")
     with raw_client(handled.server.get_port()) as other:
         other.say(camera_message(image_width=40, image_height=30))
         wait_for(lambda: len(handled.server.get_clients()) == 2, "the other client")
-        handled.act("Picture", max(handled.server.get_clients()))
+        handled.act("Picture (.png)", max(handled.server.get_clients()))
         request = other.hear_type("GetRenderRequestMessage")
         picture = {"type": "GetRenderResponseMessage", "payload": png(30, 40)}
         other.say({**picture, "render_uuid": request["render_uuid"]})
         assert other.hear_type("FileTransferStartDownload")["filename"] == "view.png"
-    handled.act("Page", silent)
+    handled.act("Page (.html)", silent)
     assert browser.hear(in_turn("FileTransferStartDownload", "GetRenderRequestMessage"))["type"].startswith(
         "File"
     )
@@ -286,8 +286,8 @@ def test_so_many_pictures_are_awaited_and_no_more(
 ) -> None:
     monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
     monkeypatch.setattr(downloads, "PICTURES_AT_ONCE", 1)
-    handled.act("Picture", handled.client_id())
-    handled.act("Picture", 1234)
+    handled.act("Picture (.png)", handled.client_id())
+    handled.act("Picture (.png)", 1234)
     notices = [item for item in drained(handled) if isinstance(item, m.Notice)]
     assert ["try again" in notice.text for notice in notices] == [True]
 
@@ -298,19 +298,19 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
     client, held, made = handled.client_id(), threading.Event(), []
 
     class Scene:
-        def as_html(self, dark: bool) -> str:
-            made.append(dark)
+        def as_html(self) -> str:
+            made.append(1)
             held.wait()
             return '<head><script>e.type="module"</script></head>'
 
     monkeypatch.setattr(handled.server, "get_scene_serializer", Scene)
     for _ in range(20):
-        handled.act("Page", client)
+        handled.act("Page (.html)", client)
     held.set()
     assert browser.hear_type("FileTransferStartDownload")["filename"] == "map.html"
     wait_for(lambda: not handled.page.downloads._begun, "the end of the work")
     assert len(made) == 1
-    handled.act("Page", client)
+    handled.act("Page (.html)", client)
     browser.hear_type("FileTransferStartDownload")
 
 

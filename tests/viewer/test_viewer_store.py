@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
+from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.map_scene import brick_edges
-from taichi_mrf.viewer.scene.voxel_layer import FREE, OCCUPIED, UNKNOWN, cut_picture, cut_voxel
+from taichi_mrf.viewer.scene.voxel_layer import FREE, OCCUPIED, UNKNOWN, cut_of, cut_picture
 from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS, offsets_in_brick
 
@@ -100,6 +101,8 @@ def test_a_cut_hides_what_lies_beyond_it(axis: int) -> None:
     cut = Cut(axis, -5)
     everything, kept = world_of(store, -50.0), world_of(store, -50.0, cut)
     assert kept == {voxel: q for voxel, q in everything.items() if voxel[axis] <= cut.voxel}
+    flipped = world_of(store, -50.0, Cut(axis, -5, flipped=True))
+    assert flipped == {voxel: q for voxel, q in everything.items() if voxel[axis] >= cut.voxel}
     assert 0 < len(kept) < len(everything)
 
 
@@ -129,11 +132,12 @@ def test_the_cut_shows_free_occupied_and_unknown_where_they_are(axis: int) -> No
 
 def test_the_cut_goes_from_one_end_of_the_map_to_the_other() -> None:
     store = VoxelStore()
-    assert cut_voxel(store, 0, 0.5) is None
+    assert cut_of(ViewOptions(cut_axis="x"), store, 0.1) is None
     put_block(store, -2, 0, 0)
     put_block(store, 3, 0, 0)
-    assert cut_voxel(store, 0, 0.0) == Cut(0, -16)
-    assert cut_voxel(store, 0, 1.0) == Cut(0, 31)
+    assert cut_of(ViewOptions(), store, 0.1) is None
+    for at_m, voxel in ((-5.0, -16), (0.3, 3), (0.39, 3), (5.0, 31)):
+        assert cut_of(ViewOptions(cut_axis="x", cut_at_m=at_m), store, 0.1) == Cut(0, voxel)
 
 
 @given(st.sets(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=12))

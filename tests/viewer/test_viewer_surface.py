@@ -211,8 +211,8 @@ def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
                         np.ones((1, 512), np.uint8), np.zeros((0, 3), np.int32)))  # fmt: skip
     drawn.take(patch())
     drawn.take(VIEW)
-    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=1.0)
-    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=0.6)
+    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=9.0)
+    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=3.85)
 
 
 def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
@@ -227,7 +227,7 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
     expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
-    drawn.draw(show="surface", color_by="marginal", shade=False)
+    drawn.draw(show="surface", color_by="probability", shade=False)
     assert len(np.unique(drawn.mesh()[2], axis=0)) == 1  # they are equally likely
     drawn.draw(shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None

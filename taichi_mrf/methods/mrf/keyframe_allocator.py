@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 else:
     (no_returns,) = later("taichi_mrf.inference", "no_returns")
 
-SCOUTS = 4
-"""One of this many neighbouring rays is followed through free space to find the crossed bricks."""
-
 
 @dataclass(frozen=True)
 class KeyframeAllocator:
@@ -68,7 +65,7 @@ class KeyframeAllocator:
         """Find the footprint of rays and claim it, if there is enough memory."""
         # The voxels o_1 .. o_N of each ray lie in the bricks that it crosses up to 3 sigma behind d_r.
         parts = (self.registry.voxel_size, self.sensor, self.volume)
-        footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
+        footprint = find_footprint(image, rays, T_world_camera, *parts, no_returns=no_returns)
         of_no_returns = 0 if no_returns is None else no_returns.nbytes
         self.budget.check(footprint, image.nbytes + rays.nbytes + of_no_returns)
         self.registry.anchor_at(T_world_camera[:3, 3])

@@ -99,7 +99,7 @@ class VisibilityIntegrator:
             visibility.visible_if_occluded, visibility.visible_if_clear, visibility.q_min, visibility.q_max,
         )  # fmt: skip
         self.index, self.crossed = WindowIndex(), WindowIndex()
-        self.bundler = RayBundler(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
+        self.bundler = RayBundler(voxel_size, InferenceConfig(ray_density=0.0), visibility_scan.SURE_SIGMAS)
         self.occluded = ti.ndarray(ti.f32, VOXELS)
         self.visible = ti.ndarray(ti.i32, VOXELS)
         self.inside = ti.ndarray(ti.i32, VOXELS)
@@ -116,7 +116,7 @@ class VisibilityIntegrator:
         beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
         footprint = find_footprint(
             image, self.bundler.rays_of(image), T_world_camera, self.voxel_size, self.sensor,
-            self.volume, visibility_scan.SURE_SIGMAS, beyond_m,
+            self.volume, self.bundler.end_sigmas, beyond_m,
         )  # fmt: skip
         voxels = len(footprint.crossed) * VOXELS
         check_memory(

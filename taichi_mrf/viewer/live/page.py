@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection
 from functools import partial
+from typing import get_args
 
 import numpy as np
 import viser
@@ -17,21 +18,25 @@ from taichi_mrf.viewer.live.panel import (
     SWITCHES,
     Clicked,
     Dragged,
+    Framed,
     Panel,
-    Point,
     VoxelAnswer,
     beside,
     facts_of,
+    facts_of_many,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
-from taichi_mrf.viewer.scene.widgets import in_markdown
+from taichi_mrf.viewer.scene.widgets import change, in_markdown
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
+
+MOST_ASKED = 32
+"""Of as many voxels in a rectangle keyframes are asked at most."""
 
 _PLAIN = ViewOptions(show="voxels")
 """Options that the mapping process serves unless it is asked for more."""
@@ -45,7 +50,8 @@ class Page(BasePage[Panel]):
         inbox = Inbox()
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
         self._hello: m.Hello
-        self._eye: Point = (0.0, 0.0, 0.0)  # from where the voxel of the answer was clicked
+        self._question: m.RayThrough | m.WhoSays  # what the answer beside the click is about
+        self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
         self._edits: list[tuple[Edit, Edit]] = []
@@ -58,6 +64,7 @@ class Page(BasePage[Panel]):
             m.SurfacePatch: lambda patch: None if self.map is None else self.map.surface.take(patch),
             m.SurfaceView: self._take_surface_view,
             m.KeyframeInfo: self._take_keyframe,
+            m.File: self._take_file,
             m.CurrentCamera: self._take_camera,
             m.Status: self._take_status,
             m.RayAnswer: self._show_ray,
@@ -66,6 +73,7 @@ class Page(BasePage[Panel]):
             m.TimeSpan: self.panel.time.show_span,
             m.SceneChanges: self.panel.time.show_changes,
             Clicked: self._clicked,
+            Framed: self._framed,
             Dragged: self._dragged,
         }
         self.actions |= {
@@ -73,14 +81,11 @@ class Page(BasePage[Panel]):
             "Pause": lambda client: ask(m.Pause(True)),
             "Step": lambda client: ask(m.Step()),
             "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
-            "Top": partial(self._look_from, "top"),
-            "Front": partial(self._look_from, "front"),
-            "Side": partial(self._look_from, "side"),
-            "Fit": partial(self._look_from, "here"),
+            **{side.capitalize(): partial(self._look_from, side) for side in get_args(Side)},
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
             "Delete the map and start again": self.panel.agree,
-            "Undo": lambda client: self._undo(),
+            "Undo": lambda client: self._redo(back=True),
             "Redo": lambda client: self._redo(),
             "Keep the map": self.panel.close_question,
             "Leave it as it is": self.panel.close_question,
@@ -91,20 +96,23 @@ class Page(BasePage[Panel]):
             "Move": lambda client: self._toggle_gizmo(),
             "Put back": lambda client: self._edit(self._move_home),
             "Position (m)": lambda client: self._edit(self._move_as_typed),
-            "Show the ray": lambda client: self._edit(self._ray_of_pixel),
+            "Show the ray": lambda client: self._edit(lambda k: m.PixelRay(k.id, *self.panel.pixel.value)),
             "Show images": lambda client: self._watch_images(),
             "View": lambda client: self._watch_images(),
             "Time (s)": lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
-            "Map": lambda client: ask(m.Save("map", client)),
-            "Voxels": lambda client: ask(m.Save("ply", client)),
-            "Mesh": lambda client: ask(m.Save("mesh", client)),
-            "Picture": self.downloads.picture,
-            "Page": lambda client: self.downloads.page(client, self.options.dark),
-            "Recording": self._record,
+            "Map (.npz)": lambda client: ask(m.Save("map", client)),
+            "Voxels (.ply)": lambda client: ask(m.Save("ply", client)),
+            "Mesh (.ply)": lambda client: ask(m.Save("mesh", client)),
+            "Picture (.png)": self.downloads.picture,
+            "Page (.html)": self.downloads.page,
+            "Recording (.viser)": self._record,
             "Close": lambda client: self.answer.clear(),
             **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
         server.scene.on_click()(lambda event: inbox.put(_click_of(event)))
+        server.scene.on_rect_select(modifier="shift")(
+            lambda event: inbox.put(Framed(event.client_id, np.array([event.screen_min, event.screen_max])))
+        )
 
     def options_changed(self, before: ViewOptions) -> None:
         """Tell the mapping process which extras are shown, and follow the camera if asked."""
@@ -126,6 +134,7 @@ class Page(BasePage[Panel]):
         self._hello, self._in_photo = hello, False
         self.answer.clear()
         self._forget_edits(self.keyframes.keyframes)
+        change(self.panel.unsaved, visible=False)
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
@@ -163,9 +172,16 @@ class Page(BasePage[Panel]):
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
+        if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
+            change(self.panel.unsaved, visible=True)
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)
+
+    def _take_file(self, file: m.File) -> None:
+        self.downloads.send(file.client, file.name, file.content)
+        if file.name.endswith(".npz"):
+            change(self.panel.unsaved, visible=False)
 
     def _take_camera(self, camera: m.CurrentCamera) -> None:
         self.keyframes.show_camera(camera)
@@ -231,17 +247,13 @@ class Page(BasePage[Panel]):
         self._show_history()
         self.ask(edit)
 
-    def _undo(self) -> None:
-        if self._done > 0:
-            self._done -= 1
+    def _redo(self, back: bool = False) -> None:
+        """Make the next edit again, or take the last one ``back``."""
+        place = self._done - back
+        if 0 <= place < len(self._edits):
+            self._done = place + (not back)
             self._show_history()
-            self.ask(self._edits[self._done][0])
-
-    def _redo(self) -> None:
-        if self._done < len(self._edits):
-            self._done += 1
-            self._show_history()
-            self.ask(self._edits[self._done - 1][1])
+            self.ask(self._edits[place][0 if back else 1])
 
     def _forget_edits(self, keyframes: Collection[int]) -> None:
         """Edits of these keyframes can no longer be taken back."""
@@ -255,15 +267,12 @@ class Page(BasePage[Panel]):
 
     def _changeable(self) -> m.KeyframeInfo | None:
         """The chosen keyframe; None, with a notice that says why, if it cannot be changed."""
-        if self.keyframes.chosen is None:
-            self.notify(m.Notice("There is no keyframe yet.", "warning"))
-            return None
-        info = self.keyframes.keyframes[self.keyframes.chosen]
-        if info.state == "frozen":
-            text = f"Keyframe {info.id} ({info.name}) is frozen: it cannot be changed."
-            self.notify(m.Notice(text, "warning"))
-            return None
-        return info
+        info = None if self.keyframes.chosen is None else self.keyframes.keyframes[self.keyframes.chosen]
+        if info is not None and info.state != "frozen":
+            return info
+        frozen = info and f"Keyframe {info.id} ({info.name}) is frozen: it cannot be changed."
+        self.notify(m.Notice(frozen or "There is no keyframe yet.", "warning"))
+        return None
 
     def _move_home(self, keyframe: m.KeyframeInfo) -> m.Request:
         return m.Move(keyframe.id, self.keyframes.roster.recorded[keyframe.id])
@@ -274,10 +283,6 @@ class Page(BasePage[Panel]):
         typed = np.array(self.panel.position.value)
         T[:3, 3] = np.where(np.abs(typed - T[:3, 3]) > 0.51 * POSITION_STEP_M, typed, T[:3, 3])
         return m.Move(keyframe.id, T)
-
-    def _ray_of_pixel(self, keyframe: m.KeyframeInfo) -> m.Request:
-        u, v = self.panel.pixel.value
-        return m.PixelRay(keyframe.id, u, v)
 
     def _toggle_gizmo(self) -> None:
         if self.keyframes.gizmo is not None:
@@ -308,7 +313,7 @@ class Page(BasePage[Panel]):
 
     def _watch_images(self) -> None:
         if not self.panel.images.value:
-            self.panel.hide_images()
+            self.panel.show_images(None)
         self._ask_for_extras()
 
     def _ask_for_extras(self) -> None:
@@ -333,17 +338,36 @@ class Page(BasePage[Panel]):
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
             x, y, z = voxel[0].tolist()
-            self.answer.move((x, y, z), click.place)
-            self.answer.show(facts_of(voxel[0], self.map.store, self._hello))
-            self._eye = click.origin
-            self.ask(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen))
+            self._facts = partial(facts_of, voxel[0], self.map.store, self._hello)
+            self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
+
+    def _framed(self, drawn: Framed) -> None:
+        """Say how large what is seen in a rectangle is, and ask which keyframes say that it is there."""
+        handle = self.server.get_clients().get(drawn.client)
+        if handle is None or self.map is None:
+            return
+        seen = framed(handle.camera, drawn.corners, self.map.points(), self._hello.voxel_size)
+        if len(seen):
+            middle = seen[np.argsort(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))]
+            asked = middle[:: -(-len(seen) // MOST_ASKED)]
+            self._facts = partial(facts_of_many, seen)
+            self._answer(
+                m.WhoSays(tuple((x, y, z) for x, y, z in asked.tolist())),
+                beside(handle.camera, drawn.corners.max(axis=0)),
+            )
+
+    def _answer(self, question: m.RayThrough | m.WhoSays, place: tuple[float, float]) -> None:
+        """Open the answer to a question at a ``place`` in the window, and ask it."""
+        self._question = question
+        self.answer.move(question.point if isinstance(question, m.RayThrough) else question.points[0], place)
+        self.answer.show(self._facts())
+        self.ask(question)
 
     def _show_votes(self, answer: m.Votes) -> None:
         if self.map is not None and answer.point == self.answer.point:
             known = self.keyframes.keyframes
             votes = [(known[id], log_odds) for id, log_odds in answer.votes if id in known]
-            facts = facts_of(np.array(answer.point), self.map.store, self._hello)
-            self.answer.show(facts, votes, answer.known)
+            self.answer.show(self._facts(), votes, answer.known)
 
     def _switch_off(self, place: int, client: int) -> None:
         """Switch off the keyframe at a place of the answer's list, and show what the others say of the
@@ -351,7 +375,7 @@ class Page(BasePage[Panel]):
         listed = self.answer.said_by[place : place + 1]
         if listed and self.keyframes.keyframes[listed[0]].state == "on" and self.answer.point is not None:
             self._make(m.Switch(listed[0], False))
-            self.ask(m.RayThrough(self.answer.point, self._eye, self.keyframes.chosen))
+            self.ask(self._question)
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
         """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
@@ -362,6 +386,5 @@ class Page(BasePage[Panel]):
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:
-    (x, y), camera = event.screen_pos, event.client.camera
-    place = beside(x * camera.image_width, y * camera.image_height, camera.image_width, camera.image_height)
+    place = beside(event.client.camera, event.screen_pos)
     return Clicked(event.ray_origin, event.ray_direction, place)

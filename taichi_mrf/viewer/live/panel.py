@@ -8,14 +8,14 @@ from typing import Any, get_args
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
-from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
+from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
 
 Point = tuple[float, float, float]
 Vote = tuple[m.KeyframeInfo, float]
@@ -41,6 +41,14 @@ class Clicked(Event):
 
 
 @dataclass(frozen=True)
+class Framed(Event):
+    """A client has drawn a rectangle over the scene, with these ``corners`` (2, 2), shares of the window."""
+
+    client: int
+    corners: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Dragged(Event):
     """The gizmo was grabbed, or let go where it is now."""
 
@@ -61,12 +69,12 @@ COMMANDS = {
 """Entries of the command palette: action, key, and the key that is held with it."""
 EDIT_BUTTONS = ("On/off", "Freeze", "Move", "Put back")
 SAVE_BUTTONS = {
-    "Map": "The map with its keyframes: a .npz file for `taichi-mrf live` and `MRFMap.load`.",
-    "Voxels": "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
-    "Mesh": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
-    "Picture": "What this browser shows, as a .png file.",
-    "Page": "The scene as one .html file that any browser opens, without a server.",
-    "Recording": "Start recording the scene; press again to get it as a .viser file.",
+    "Map (.npz)": "The map with its keyframes, for `taichi-mrf live` and `MRFMap.load`.",
+    "Voxels (.ply)": "The voxels with probability 0.5 or more, for MeshLab, CloudCompare or Blender.",
+    "Mesh (.ply)": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it.",
+    "Picture (.png)": "What this browser shows.",
+    "Page (.html)": "The scene in one file that any browser opens, without a server.",
+    "Recording (.viser)": "Start recording the scene; press again to get the file.",
 }
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
@@ -74,7 +82,8 @@ NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
-    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "show_baseline",
+    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks",
+    "show_baseline",
 )  # fmt: skip
 TIME_STEP_S = 0.1
 
@@ -94,7 +103,8 @@ class Panel(BasePanel):
         self.add_buttons(
             "View",
             ("Top", "Front", "Side", "Fit"),
-            "Keys 1, 2, 3 and 0. F follows the camera; Ctrl-K lists all.",
+            "Keys 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
+            "with Shift held, to see which keyframes say what is there, and how large it is.",
         )
         self.view_options.add("follow")
         for label, command in COMMANDS.items():
@@ -110,7 +120,8 @@ class Panel(BasePanel):
             self.view_options.add(*_MAP_OPTIONS)
             with gui.add_folder("Space"):
                 self.view_options.add("ground", "axes")
-            self.view_options.add("pictures", "dark")
+            self.view_options.add("pictures")
+            self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
         with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
@@ -118,6 +129,7 @@ class Panel(BasePanel):
         with tabs.add_tab("Images", viser.Icon.PHOTO):
             self._images_tab()
         with tabs.add_tab("Save", viser.Icon.DOWNLOAD):
+            self.unsaved = gui.add_markdown("The map has changes that are not saved.", visible=False)
             for name, hint in SAVE_BUTTONS.items():
                 self.add_button(name, hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
@@ -147,11 +159,9 @@ class Panel(BasePanel):
 
     def show_history(self, can_undo: bool, can_redo: bool) -> None:
         """Offer to take edits back, and to make them again, if there are any."""
-        offered = (can_undo, can_redo)
-        names = tuple(name for name, can in zip(HISTORY_BUTTONS, offered, strict=True) if can)
-        self._history.visible = bool(names)
-        if names and tuple(self._history.options) != names:
-            self._history.options = names
+        offered = zip(HISTORY_BUTTONS, (can_undo, can_redo), strict=True)
+        names = tuple(name for name, can in offered if can)
+        change(self._history, visible=bool(names), options=names or self._history.options)
 
     def set_following(self, on: bool | None = None) -> None:
         """Set the box that follows the camera; None turns it over."""
@@ -186,16 +196,11 @@ class Panel(BasePanel):
 
     def _show_speed(self, factor: float | None) -> None:
         """Set the dropdown to the speed in force, also one that only the command line offers."""
-        if self.speed.visible != (factor is not None):
-            self.speed.visible = factor is not None
+        change(self.speed, visible=factor is not None)
         if factor is None:
             return
         name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
-        names = list(SPEEDS) if name in SPEEDS else [*SPEEDS, name]
-        if list(self.speed.options) != names:
-            self.speed.options = names
-        if self.speed.value != name:
-            self.speed.value = name
+        change(self.speed, options=tuple(dict.fromkeys([*SPEEDS, name])), value=name)
 
     def show_keyframes(self, keyframes: dict[int, m.KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
@@ -207,10 +212,8 @@ class Panel(BasePanel):
         self.keyframe.value = name or self.keyframe.options[0]
         fixed = chosen is None or keyframes[chosen].state == "frozen"
         for widget in (self.position, self.pixel, self._pixel_button):
-            if widget.disabled != fixed:
-                widget.disabled = fixed
-        if self._edits.visible == fixed:  # viser cannot disable a row of buttons
-            self._edits.visible = not fixed
+            change(widget, disabled=fixed)
+        change(self._edits, visible=not fixed)  # viser cannot disable a row of buttons
         if chosen is None:
             self._keyframe_text.content = ""
             return
@@ -223,19 +226,14 @@ class Panel(BasePanel):
         """The keyframe that is selected in the dropdown."""
         return self._names.get(self.keyframe.value)
 
-    def show_images(self, images: m.Images) -> None:
-        """Show the images of one view."""
-        self._measured.image, self._rendered.image = images.measured, images.rendered
-        self._accuracy.image = images.accuracy
-        for picture in (self._measured, self._rendered, self._accuracy):
-            picture.visible = True
-        self._score.content = f"**{in_markdown(images.title)}**\n\n{in_markdown(images.score)}"
-
-    def hide_images(self) -> None:
-        """Hide the images, which are not updated any more."""
-        for picture in (self._measured, self._rendered, self._accuracy):
-            picture.visible = False
-        self._score.content = ""
+    def show_images(self, images: m.Images | None) -> None:
+        """Show the images of one view; None hides them when they are not updated any more."""
+        for name, picture in self._pictures.items():
+            if images is not None:
+                picture.image = getattr(images, name)
+            picture.visible = images is not None
+        title, score = ("", "") if images is None else (images.title, images.score)
+        self._score.content = f"**{in_markdown(title)}**\n\n{in_markdown(score)}" if title else ""
 
     def ask(
         self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str, then: Callable[[], None]
@@ -292,11 +290,13 @@ class Panel(BasePanel):
         self.images = self.watch(gui.add_checkbox("Show images", False, hint=hint))
         self.view = self.watch(gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
         self._score = gui.add_markdown("")
+        labels = {
+            "measured": "measured depth",
+            "rendered": "depth rendered from the map",
+            "accuracy": "accuracy: right (blue), wrong (orange), no surface (light), not judged (dark)",
+        }
         black = np.zeros((2, 2, 3), np.uint8)
-        self._measured = gui.add_image(black, label="measured depth", visible=False)
-        self._rendered = gui.add_image(black, label="depth rendered from the map", visible=False)
-        label = "accuracy: right (blue), wrong (orange), no surface (light), not judged (dark)"
-        self._accuracy = gui.add_image(black, label=label, visible=False)
+        self._pictures = {n: gui.add_image(black, label=label, visible=False) for n, label in labels.items()}
 
 
 def _colors_of(hello: m.Hello) -> tuple[ColorBy, ...]:
@@ -347,10 +347,8 @@ class TimeFolder:
         last_s = max(_on_grid(span.now_s - span.start_s), TIME_STEP_S)
         first_s = min(_on_grid(span.first_s - span.start_s), last_s - TIME_STEP_S)
         shown_s = last_s if span.shown_s is None else _on_grid(span.shown_s - span.start_s)
-        values = {"min": first_s, "max": last_s, "value": shown_s, "disabled": span.now_s <= span.first_s}
-        for name, value in values.items():
-            if getattr(self.slider, name) != value:
-                setattr(self.slider, name, value)
+        disabled = span.now_s <= span.first_s
+        change(self.slider, min=first_s, max=last_s, value=shown_s, disabled=disabled)
         if not known:
             self._show_list()
 
@@ -387,9 +385,9 @@ class VoxelAnswer:
         """The voxel that is shown, in metres, world; None without one."""
         self._apart: dict[str, str] = {}
         self._panel = panel.gui.add_panel(visible=False)
-        with self._panel.add_tab("Voxel", viser.Icon.CUBE):
+        with self._panel.add_tab("Answer", viser.Icon.CUBE):
             self._text = panel.gui.add_html("")
-            hint = "Remove this keyframe from the map."
+            hint = "Remove this keyframe from the map; Undo brings it back."
             self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
             panel.add_button("Close", color="gray")
         self.said_by: list[int] = []
@@ -401,6 +399,7 @@ class VoxelAnswer:
         before, self.point = self.point, point
         self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
         self._panel.visible = True
+        self._panel.expand()
         if before is not None and before != point:
             ends = np.array([before, point])
             self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
@@ -415,11 +414,12 @@ class VoxelAnswer:
     def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
         """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest
         first, each with a button; ``known`` is None before they have been asked."""
-        self._scene.add_label("/answer", facts["state"], position=np.array(self.point))
+        label = facts.get("state") or f"{facts['voxels']} voxels"
+        self._scene.add_label("/answer", label, position=np.array(self.point))
         text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
         if known:
-            seen_by = f"{len(votes)} keyframes see it" if len(votes) > 1 else "one keyframe sees it"
-            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees it"
+            seen_by = f"{len(votes)} keyframes see this" if len(votes) > 1 else "one keyframe sees this"
+            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees this"
         self._text.content = (
             f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
         )
@@ -436,9 +436,11 @@ class VoxelAnswer:
             self._scene.remove_by_name(name)
 
 
-def beside(x: float, y: float, width: int, height: int) -> tuple[float, float]:
-    """The panel's upper left corner, in pixels: beside a click at (x, y) in a window of this size, towards
+def beside(camera: viser.CameraHandle, share: ArrayLike) -> tuple[float, float]:
+    """The panel's upper left corner, in pixels: beside a place (2,), in shares of a browser's window, towards
     its middle, as far as it fits in."""
+    width, height = camera.image_width, camera.image_height
+    x, y = (np.asarray(share) * (width, height)).tolist()
     left = x + _ASIDE_PX if x < 0.45 * width else x - _ASIDE_PX - _WIDTH_PX
     return max(left, 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
 
@@ -447,6 +449,16 @@ def in_words(log_odds: float) -> str:
     """What a keyframe alone would say of a voxel."""
     sure = 1 / (1 + np.exp(-abs(log_odds)))
     return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
+
+
+def facts_of_many(points: NDArray[np.float64]) -> dict[str, str]:
+    """Number, middle and size of some voxels with centres (n, 3) in metres."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return {
+        "voxels": f"{len(points):,}",
+        "middle x, y, z (m)": ", ".join(f"{value:.2f}" for value in (low + high) / 2),
+        "size x, y, z (m)": " x ".join(f"{value:.2f}" for value in high - low),
+    }
 
 
 def facts_of(point: NDArray[np.float64], store: VoxelStore, hello: m.Hello) -> dict[str, str]:

@@ -59,7 +59,7 @@ class BasePage(Generic[P]):
         self.map: MapScene | None = None
         self._scale: Scale | None = None
         self._with_baseline = False
-        self.actions: dict[str, Callable[[int], None]] = {}
+        self.actions: dict[str, Callable[[int], None]] = {BasePanel.DARK_OR_LIGHT[0]: self._turn_colors}
         """Function of each action, given the client that asked for it."""
         self.handlers: dict[type, Callable[[Any], None]] = {
             m.Notice: self.notify,
@@ -69,9 +69,11 @@ class BasePage(Generic[P]):
             Joined: lambda joined: self.viewpoint.joined(joined.client),
         }
         """Handler of each kind of update and event; other kinds are ignored."""
-        self._show_theme()
+        self._theme: Any = {"show_logo": False, "show_share_button": False}
+        server.gui.configure_theme(control_width=self.control_width, **self._theme)
         server.scene.set_background_image(_backdrop(), format="png")
         server.scene.configure_default_lights(cast_shadow=False)
+        panel.show_cut(None)
         server.on_client_connect(lambda client: inbox.put(Joined(client.client_id)))
 
     def run(self) -> None:
@@ -119,20 +121,25 @@ class BasePage(Generic[P]):
         before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
-        if self.options.dark != before.dark:
-            self._show_theme()
+        if self.options.cut_axis != before.cut_axis:
+            self._offer_cuts(in_middle=True)
+            self.options = self.panel.view_options.value()
         self.options_changed(before)
         self.keyframes.show_pictures(self.options.pictures)
         if self.map is not None:
             self.map.look_changed()
 
-    def _show_theme(self) -> None:
-        self.server.gui.configure_theme(
-            control_width=self.control_width,
-            dark_mode=self.options.dark,
-            show_share_button=False,
-            show_logo=False,
-        )
+    def _turn_colors(self, client: int) -> None:
+        """The page's script takes dark colours as its user's wish for the others than now."""
+        handle = self.server.get_clients().get(client)
+        if handle is not None:
+            handle.gui.configure_theme(control_width=self.control_width, dark_mode=True, **self._theme)
+
+    def _offer_cuts(self, in_middle: bool = False) -> None:
+        """Let the cut go from one end of the map to the other."""
+        ends_m, axis = None if self.map is None else self.map.layers["map"].ends_m(), self.options.cut_axis
+        along = None if ends_m is None or axis == "none" else ends_m[:, "xyz".index(axis)]
+        self.panel.show_cut(along, in_middle)
 
     def _flush(self) -> None:
         """Draw what has changed of the map, if it is time."""
@@ -142,6 +149,7 @@ class BasePage(Generic[P]):
         if not self.map.flush(self.options, self.viewpoint.up, crossed, self._announce):
             return
         self.show_counts()
+        self._offer_cuts()
         with_baseline = bool(self.map.layers["baseline"].store.chunks)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline

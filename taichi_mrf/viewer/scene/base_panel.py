@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import Notice, Update
 from taichi_mrf.viewer.scene.coloring import ViewOptions
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, in_html
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, change, in_html
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
 
@@ -84,6 +86,8 @@ _LONGEST_POP_UP = 500
 class BasePanel:
     """Adds widgets to the current container of the GUI; each use of them calls ``tell`` with an event."""
 
+    DARK_OR_LIGHT = "Dark or light", "The panel's colours in this browser; at first as its system has them."
+
     def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
         self.gui, self._tell = gui, tell
@@ -142,6 +146,16 @@ class BasePanel:
         text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
         text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
         self._shown.content = text + (" · recording" if recording else "")
+
+    def show_cut(self, ends_m: NDArray[np.float64] | None, in_middle: bool = False) -> None:
+        """Offer cuts between these coordinates (2,), and cut in the middle of them if asked; None: no cut."""
+        slider, flip = (self.view_options.handles[name] for name in ("cut_at_m", "flip_cut"))
+        for handle in (slider, flip):
+            change(handle, visible=ends_m is not None)
+        if ends_m is not None:
+            low, high = np.round(ends_m, 2).tolist()
+            middle = round((low + high) / 2, 2) if in_middle else min(max(slider.value, low), high)
+            change(slider, min=low, max=high, value=middle)
 
     def show_legend(self, legend_html: str) -> None:
         """Show the scale of the colours."""

@@ -18,8 +18,8 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
-ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
-OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")
+ColorBy = Literal["probability", "height", "uncertainty", "keyframes", "photo"]
+OF_BELIEFS: tuple[ColorBy, ...] = ("probability", "height", "uncertainty")
 """Choices of what the colour shows of every map."""
 Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
@@ -48,11 +48,14 @@ class ViewOptions:
     """Darken voxels and the surface a little by the direction that they face: shapes are easier to see."""
 
     cut_axis: CutAxis = "none"
-    """Cut the map open across this axis. The cut shows free space (blue), occupied (yellow) and unknown
-    (nothing)."""
+    """Cut the map open across this axis of the world. The cut shows free space (blue), occupied (yellow) and
+    unknown (nothing)."""
 
-    cut_at: Annotated[float, Range(0.0, 1.0, 0.005)] = 0.5
-    """Position of the cut, from one end of the map (0) to the other (1)."""
+    cut_at_m: Annotated[float, Range(-1.0, 1.0, 0.01)] = 0.0
+    """Coordinate of the cut on its axis, in metres; the slider goes from one end of the map to the other."""
+
+    flip_cut: bool = False
+    """Hide what lies before the cut, and not what lies behind it."""
 
     bricks: bool = False
     """Draw the outlines of the map's bricks of 8 x 8 x 8 voxels."""
@@ -75,12 +78,9 @@ class ViewOptions:
     dynamic: bool = True
     """Show in red what is dynamic: occupied now, although all keyframes together say that it is free."""
 
-    dark: bool = False
-    """Dark colours for the page's panel."""
-
 
 _MAPS: dict[ColorBy, str] = {
-    "marginal": "viridis",
+    "probability": "viridis",
     "height": "Spectral_r",
     "uncertainty": "magma",
     "keyframes": "plasma",

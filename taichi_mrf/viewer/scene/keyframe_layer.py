@@ -344,6 +344,28 @@ def first_voxel(
     return centres[first], float(range_m[first])
 
 
+def framed(
+    camera: viser.CameraHandle, corners: NDArray[np.float64], points: NDArray[np.float64], side_m: float
+) -> NDArray[np.float64]:
+    """Of some points (n, 3) in metres, world, those that a browser's camera sees in a rectangle with these
+    corners (2, 2), shares of the window. Of voxels of this side, those count that others do not hide; a
+    slanted surface is some of them deep."""
+    local = (points - camera.position) @ np.asarray(vtf.SO3(camera.wxyz).as_matrix())
+    tall = np.tan(0.5 * camera.fov)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = local[:, :2] / local[:, 2:]
+    shares = 0.5 + 0.5 * slopes / (tall * camera.aspect, tall)
+    inside = (local[:, 2] > 0) & ((shares >= corners[0]) & (shares <= corners[1])).all(axis=1)
+    points, slopes, range_m = points[inside], slopes[inside], local[inside, 2]
+    if not len(points):
+        return points
+    cells = np.floor(slopes * range_m.min() / (2.0 * side_m))
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    nearest_m = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest_m, cell.reshape(-1), range_m)
+    return points[range_m <= nearest_m[cell.reshape(-1)] + 4.0 * side_m]
+
+
 def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:
     """The pixel that a ray hits first, of all pictures of keyframes."""
     start = np.asarray(origin, np.float64)

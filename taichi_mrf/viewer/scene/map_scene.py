@@ -17,6 +17,7 @@ from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
+from taichi_mrf.viewer.scene.widgets import change
 from taichi_mrf.voxels.layout import BRICK
 
 UPDATES_PER_SECOND = 8
@@ -182,8 +183,7 @@ class MapScene:
     def _show_surface(self, visible: bool) -> None:
         """Show the surface in the place of voxels, or these."""
         self.surface.send(visible)
-        if self._voxels.visible == visible:
-            self._voxels.visible = not visible
+        change(self._voxels, visible=not visible)
 
     def _show_space(self, options: ViewOptions, up: Up) -> None:
         """Show the axes, and the ground under the map while that has the same box."""
@@ -195,8 +195,7 @@ class MapScene:
             if len(points):
                 height_m = up[1] * float(np.quantile(up[1] * points[:, up[0]], _LOWEST_SHARE))
                 self.ground.show(*box, up, height_m - up[1] * 0.5 * self._hello.voxel_size)
-        if self._server.scene.world_axes.visible != options.axes:
-            self._server.scene.world_axes.visible = options.axes
+        change(self._server.scene.world_axes, visible=options.axes)
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
         hello, scene = self._hello, self._server.scene

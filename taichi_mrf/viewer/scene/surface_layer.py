@@ -17,6 +17,7 @@ from taichi_mrf.viewer.messages import SurfacePatch, SurfaceView
 from taichi_mrf.viewer.scene.coloring import Scale, height_scale, std_colors, std_scale, voxel_colors
 from taichi_mrf.viewer.scene.voxel_layer import Look
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore
+from taichi_mrf.viewer.scene.widgets import change
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 _DARKEST = 0.62
@@ -118,8 +119,7 @@ class SurfaceLayer:
                     name, mesh[1], position=self._corner_m(key), cast_shadow=False, receive_shadow=False
                 )
         self._prepared.clear()
-        if self._root.visible != visible:
-            self._root.visible = visible
+        change(self._root, visible=visible)
 
     def clear(self) -> None:
         """Remove everything from the scene."""
@@ -149,8 +149,8 @@ class SurfaceLayer:
         """The triangles that are not cut away."""
         if cut is None:
             return patch.triangles
-        before = patch.vertices_m[:, cut.axis] <= (cut.voxel + 1) * self._voxel_size
-        return patch.triangles[before[patch.triangles].all(axis=1)]
+        kept = cut.keeps(patch.vertices_m[:, cut.axis] / self._voxel_size)
+        return patch.triangles[kept[patch.triangles].all(axis=1)]
 
     def _colors(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> NDArray[np.uint8]:
         view = self._view

@@ -1,6 +1,6 @@
 """The viewpoint of the browsers: a view of the whole map at first, and a view that follows the camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,18 +11,14 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import SurfaceView
 
-Side = Literal["top", "front", "side", "here"]
-"""From where to look at the whole map; *here* is the direction from where a browser looks now."""
+Side = Literal["top", "front", "side", "fit"]
+"""From where to look at the whole map; *fit* is the direction from where a browser looks now."""
 
 _GROWTH = 1.2
 """The first view is chosen again when the map has grown by this factor."""
 
-_PANEL_SHARE = 0.2
-"""Distance of the map's centre to the left of the window's, as a share of the map's size: the panel covers
-the right side."""
-
-_BACK, _ASIDE = 1.25, 0.1
-"""The page's view is so many times as far away as the picture's, and moved aside by this share of the
+_BACK, _ASIDE = 1.25, 0.2
+"""The page's view is so many times as far away as the picture's, and moved aside by this share of half the
 window's width: the panel covers the right side."""
 
 _ASPECT = 1.6
@@ -41,12 +37,26 @@ _WIDE_RAD = np.deg2rad(75.0)
 
 @dataclass(frozen=True)
 class _View:
-    """From where a browser looks: metres, world."""
+    """From where a browser looks: metres, world. A view of the ``whole`` map is moved aside for the panel in
+    a wide window, and back in a narrow one; others suit every window."""
 
     eye_m: NDArray[np.float64]
     target_m: NDArray[np.float64]
     up: NDArray[np.float64]
     fov_rad: float = _WIDE_RAD
+    whole: bool = False
+
+    def within(self, aspect: float) -> "_View":
+        """The view in a window of this width over height."""
+        if not self.whole:
+            return self
+        along = self.target_m - self.eye_m
+        if aspect <= 1:
+            back = max(1.0, _ASPECT * (1 - _PANEL_OF_WINDOW) / aspect)
+            return replace(self, eye_m=self.target_m - back * along)
+        half_m = aspect * np.tan(0.5 * self.fov_rad) * np.linalg.norm(along)
+        aside = _ASIDE * half_m * _unit(np.cross(along, self.up))
+        return replace(self, eye_m=self.eye_m + aside, target_m=self.target_m + aside)
 
 
 class ViewpointController:
@@ -127,10 +137,8 @@ class ViewpointController:
             return
         self._as_pictured = True
         along = view.target_m - view.eye_m
-        width_m = 2.0 * _BACK * float(np.linalg.norm(along)) * np.tan(0.5 * view.fov_rad) * _ASPECT
-        right = np.cross(along, view.up)
-        target = view.target_m + _ASIDE * width_m * right / np.linalg.norm(right)
-        self._begin_with(_View(target - _BACK * along, target, view.up, view.fov_rad))
+        eye_m = view.target_m - _BACK * along
+        self._begin_with(_View(eye_m, view.target_m, view.up, view.fov_rad, whole=True))
 
     def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Look at the whole box from ``low`` to ``high`` (metres, world): browsers that connect later, and
@@ -147,10 +155,8 @@ class ViewpointController:
         aside = np.zeros(3)
         camera = centre if self._camera is None else self._camera[:3, 3]
         aside[short], aside[long] = np.sign(camera[short] - centre[short]) or 1.0, 0.35
-        right = np.cross(up, aside) / np.linalg.norm(aside)
-        target = centre + _PANEL_SHARE * size * right
-        eye = target + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
-        self._begin_with(_View(eye, target, up))
+        eye = centre + 0.5 * size * _unit(aside) + 0.7 * size * up
+        self._begin_with(_View(eye, centre, up, whole=True))
 
     def _begin_with(self, view: _View) -> None:
         """Show this view to browsers that connect later, and to those whose user has not moved theirs."""
@@ -178,6 +184,7 @@ class ViewpointController:
         slowly takes its first view after it was pointed elsewhere."""
         view = self._shared_view()
         if view is not None:
+            view = view.within(_ASPECT)
             start = self._server.initial_camera
             start.position, start.look_at, start.up, start.fov = (
                 view.eye_m, view.target_m, view.up, view.fov_rad,
@@ -192,6 +199,7 @@ class ViewpointController:
         return _View(position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward, up)
 
     def _point(self, client: viser.ClientHandle, view: _View) -> None:
+        view = view.within(client.camera.aspect)
         with client.atomic():
             client.camera.up_direction = view.up
             client.camera.position = view.eye_m

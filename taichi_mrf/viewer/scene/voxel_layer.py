@@ -31,14 +31,15 @@ _WXYZ = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 _AXES = ((1, 2), (2, 0), (0, 1))
 
 
-def cut_voxel(store: VoxelStore, axis: int, share: float) -> Cut | None:
-    """The cut at a position between one end of the map (0) and the other (1) along ``axis``; None for an
-    empty map."""
+def cut_of(options: ViewOptions, store: VoxelStore, voxel_size: float) -> Cut | None:
+    """The cut that is asked for, through a layer of the map's voxels; None without, and for an empty map."""
     bounds = store.bounds()
-    if bounds is None:
+    if bounds is None or options.cut_axis == "none":
         return None
+    axis = "xyz".index(options.cut_axis)
     low, high = int(bounds[0][axis]) * BRICK, int(bounds[1][axis] + 1) * BRICK - 1
-    return Cut(axis, low + round(share * (high - low)))
+    voxel = int(np.floor(options.cut_at_m / voxel_size + 1e-6))
+    return Cut(axis, min(max(voxel, low), high), options.flip_cut)
 
 
 def cut_picture(
@@ -87,7 +88,7 @@ def show_cut(
     low_m = bounds[0] * BRICK * voxel_size
     high_m = (bounds[1] + 1) * BRICK * voxel_size
     centre = (low_m + high_m) / 2
-    centre[cut.axis] = (cut.voxel + 1) * voxel_size
+    centre[cut.axis] = cut.plane * voxel_size
     columns, rows = _AXES[cut.axis]
     shrink = -(-max(picture.shape[:2]) // _MOST_PIXELS)
     if shrink == 1:  # so that the edges of voxels stay sharp when seen from near
@@ -293,12 +294,9 @@ class VoxelLayer:
 
 def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
     """How the voxels of a map look."""
-    cut = None
-    if options.cut_axis != "none":
-        cut = cut_voxel(store, "xyz".index(options.cut_axis), options.cut_at)
     return Look(
         log_odds=float(np.log(options.threshold / (1 - options.threshold))),
-        cut=cut,
+        cut=cut_of(options, store, voxel_size),
         scale=scale_of(
             options.color_by,
             options.threshold,

@@ -4,7 +4,7 @@ A chunk of 64^3 voxels is the unit that is sent to browsers. It holds its bricks
 show, without the mapping process.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,20 @@ class Shown:
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across ``axis``: the voxels whose coordinate there is more than ``voxel`` are hidden."""
+    """A plane across ``axis``: voxels beyond ``voxel`` there are hidden; if ``flipped``, those before it."""
 
     axis: int
     voxel: int
+    flipped: bool = False
+
+    @property
+    def plane(self) -> int:
+        """The open side of the voxels at the cut, in voxels."""
+        return self.voxel + (not self.flipped)
+
+    def keeps(self, coordinates: NDArray) -> NDArray[np.bool_]:
+        """Which coordinates (n,) of points on the axis, in voxels, are not cut away."""
+        return coordinates >= self.plane if self.flipped else coordinates <= self.plane
 
 
 def facing(cells: NDArray[np.uint8], across: int = CHUNK_VOXELS) -> NDArray[np.uint8]:
@@ -107,14 +117,13 @@ class Chunk:
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
 
-    def at_least(self, log_odds: float, hidden_above: tuple[int, int] | None = None) -> Shown:
-        """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
-        cell along that axis is at most that."""
+    def at_least(self, log_odds: float, cut: Cut | None = None) -> Shown:
+        """The voxels of at least these log-odds that are not cut away; the ``cut`` counts from the chunk."""
         every = {name: values.reshape(-1, *values.shape[2:]) for name, values in self.values.items()}
         voxels = np.flatnonzero(every[LOG_ODDS] >= np.ceil(log_odds / LOG_ODDS_STEP))
         cells = _CELLS[self._codes.astype(np.int32)[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
-        if hidden_above is not None:
-            kept = cells[:, hidden_above[0]] <= hidden_above[1]
+        if cut is not None:
+            kept = cut.keeps(cells[:, cut.axis] + 0.5)
             voxels, cells = voxels[kept], cells[kept]
         return Shown(cells, **{name: values[voxels] for name, values in every.items()})
 
@@ -213,10 +222,9 @@ class VoxelStore:
         chunk = self.chunks.get(key)
         if chunk is None:
             return Chunk().at_least(log_odds)
-        hidden_above = None
         if cut is not None:
-            hidden_above = cut.axis, cut.voxel - key[cut.axis] * CHUNK_VOXELS
-        return chunk.at_least(log_odds, hidden_above)
+            cut = replace(cut, voxel=cut.voxel - key[cut.axis] * CHUNK_VOXELS)
+        return chunk.at_least(log_odds, cut)
 
 
 def _missing(name: str, bricks: int) -> NDArray:

@@ -68,8 +68,7 @@ class OptionWidgets(Generic[T]):
 
     def offer(self, name: str, choices: Sequence[str]) -> None:
         """Let a dropdown offer these choices only."""
-        if tuple(self.handles[name].options) != tuple(choices):
-            self.handles[name].options = tuple(choices)
+        change(self.handles[name], options=tuple(choices))
 
     def value(self) -> T:
         """The options with the values of the widgets."""
@@ -79,9 +78,17 @@ class OptionWidgets(Generic[T]):
         return result
 
 
+def change(handle: Any, **values: Any) -> None:
+    """Set those properties of a widget or a scene node that differ: browsers are told of each that is set."""
+    for name, value in values.items():
+        if getattr(handle, name) != value:
+            setattr(handle, name, value)
+
+
 def label_of(name: str) -> str:
-    """The label of a field."""
-    return name.replace("_", " ").capitalize()
+    """The label of a field; one in metres says so at its end."""
+    words = name.removesuffix("_m").replace("_", " ").capitalize()
+    return f"{words} (m)" if name.endswith("_m") else words
 
 
 def add_widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:

@@ -61,7 +61,7 @@ class Downloads:
             work = (client, "picture", lambda: self._picture(client))
             threading.Thread(target=self._finish, args=work, name="picture", daemon=True).start()
 
-    def page(self, client: int, dark: bool) -> None:
+    def page(self, client: int) -> None:
         """Give a browser the scene as one HTML file."""
         if self._begin(client, "page"):
             scene = self._server.get_scene_serializer()
@@ -69,7 +69,7 @@ class Downloads:
                 self._finish,
                 client,
                 "page",
-                lambda: self.send(client, "map.html", standalone_page(scene, dark).encode()),
+                lambda: self.send(client, "map.html", standalone_page(scene).encode()),
             )
 
     def toggle_recording(self, client: int) -> None:
@@ -124,10 +124,10 @@ class Downloads:
                 self._begun.discard((client, kind))
 
 
-def standalone_page(scene: StateSerializer, dark: bool) -> str:
+def standalone_page(scene: StateSerializer) -> str:
     """The HTML of a scene. It runs only viser's scripts, even if the scene holds text with scripts in it, and
     loads nothing from a network. Raises ViewerError if viser's page is not built as this package knows it."""
     nonce = secrets.token_urlsafe(16)
     policy = POLICY.format(nonce=nonce, server="")
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-    return with_nonce(scene.as_html(dark), nonce).replace("<head>", f"<head>{meta}", 1)
+    return with_nonce(scene.as_html(), nonce).replace("<head>", f"<head>{meta}", 1)

@@ -69,8 +69,11 @@ class Gate:
                 known = scene is not None and internals.node(scene, message.name) is not None
                 return _tidy_click(message) if known and (message.instance_index or 0) >= 0 else None
             case theirs.ScenePointerMessage():
-                is_click = message.event_type == "click" and len(message.screen_pos) == 1
-                return _tidy_click(message) if is_click else None
+                if message.event_type == "click":
+                    return _tidy_click(message) if len(message.screen_pos) == 1 else None
+                corners = [share for corner in message.screen_pos for share in corner]
+                is_rectangle = len(message.screen_pos) == 2 and 0 <= min(corners) <= max(corners) <= 1
+                return replace(message, ray_origin=None, ray_direction=None) if is_rectangle else None
             case theirs.GetRenderResponseMessage():
                 return message if self.awaits_picture(client_id) else None
             case theirs.CommandTriggerMessage():

@@ -1,10 +1,14 @@
-"""Check that the page still has a server and a mapping process behind it: the server's answer, and a script
-in the page that asks.
+"""The page's own script, and the server's answer to it: whether the page still has a server and a mapping
+process behind it.
 
 viser's client notices only that its socket is closed, and a process that is stopped closes nothing. It keeps
 the last words of the panel, which may be "done". So the script asks each second, says in words what does not
 answer, and hides what the panel says is being done. It lets the client connect again also without the focus,
 and reloads the page of a server that answers while the socket stays closed.
+
+The script also gives the page the colours that the system prefers until a user turns them over, shows the
+tooltips of labels, and on a phone folds the panel at first, makes it as wide as the window, and leaves out
+viser's initial view of wide windows, which may come after the page's own.
 """
 
 import http
@@ -26,20 +30,52 @@ ACTIVITY = "taichi-mrf-activity"
 
 SCRIPT = (
     """(() => {
-const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20;
+const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20, KEPT = "taichi-mrf-scheme";
 document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
-let timer, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
+let timer, socket, theme, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
+const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
+const preferred = () => system.matches ? "dark" : "light";
+const scheme = () => localStorage.getItem(KEPT) ?? preferred();
 window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
   constructor(...given) {
     super(...given);
+    socket = this;
     this.addEventListener("message", ({data}) => {
+      if (innerWidth <= innerHeight) data.messages = data.messages?.filter(({initial}) => !initial);
+      for (const message of data?.messages ?? []) {
+        if (message.type !== "ThemeConfigurationMessage") continue;
+        theme = message;
+        if (theme.dark_mode) {  // the server asks for the other colours
+          const other = scheme() === "dark" ? "light" : "dark";
+          other === preferred() ? localStorage.removeItem(KEPT) : localStorage.setItem(KEPT, other);
+        }
+        theme.dark_mode = scheme() === "dark";
+      }
       if (data?.type === "connected") [wasOpen, closed] = [true, false];
       if (data?.type === "closed") [closed, hasClosed] = [true, true];
     });
   }
 };
+system.addEventListener("change", () => {
+  const data = {type: "message_batch", messages: [{...theme, dark_mode: false}]};
+  if (theme) socket.dispatchEvent(new MessageEvent("message", {data}));
+});
+const fold = () => {
+  const head = document.querySelector('[style*="cursor: pointer"][style*="; height: 3.5em"]');
+  head ? head.click() : requestAnimationFrame(fold);
+};
+if (matchMedia("(max-width: 36em)").matches) fold();  // the width from which on viser has a floating panel
+for (const [event, inner] of [["mouseover", "mouseenter"], ["mouseout", "mouseleave"]])
+  document.addEventListener(event, ({target}) => {  // the label of a widget shows its tooltip, too
+    const widget = target.matches?.("label[for]") && target.parentElement.parentElement.nextElementSibling;
+    if (widget) widget.firstElementChild?.dispatchEvent(new MouseEvent(inner));
+  });
 const style = document.createElement("style");
 style.textContent = `
+  @media (max-width: 36em) {
+    [style*="width: 20em"] { width: 100% !important; }
+    [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
+  }
   html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }
   #cut-off { position: fixed; inset: 0 0 auto; z-index: 100000; padding: 0.6em; text-align: center;
     font: 600 16px sans-serif; color: #fff; background: #c92a2a; pointer-events: none; }
@@ -51,7 +87,7 @@ banner.setAttribute("role", "alert");
 const say = words => {
   if (words !== banner.textContent) banner.textContent = words;
   if (!banner.isConnected) document.body.append(banner);
-  document.documentElement.toggleAttribute("data-cut-off", words !== "");
+  root.toggleAttribute("data-cut-off", words !== "");
 };
 const GONE = "disconnected: reload the page if it does not come back by itself";
 const ask = async () => {

@@ -18,7 +18,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS
-from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, in_html, in_markdown
+from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, change, in_html, in_markdown
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
@@ -38,8 +38,8 @@ SAVE_BUTTONS = {
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
-    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "ground", "axes", "pictures",
-    "dark",
+    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
+    "axes", "pictures",
 )  # fmt: skip
 
 _OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
@@ -89,6 +89,7 @@ class TunePanel(BasePanel):
             self.add_legend()
             self.view_options.add(*MAP_OPTIONS)
             self.view_options.offer("color_by", OF_BELIEFS)
+            self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
             self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
@@ -117,8 +118,7 @@ class TunePanel(BasePanel):
         self._knobs.follow(config)
         for section in _OWN:
             folder, visible = self._folders[section], METHODS[config.method].section == section
-            if folder.visible != visible:
-                folder.visible = visible
+            change(folder, visible=visible)
         self.noise.follow(config.sensor)
 
     def show_tuning(self, tuning: Tuning) -> None:
@@ -144,8 +144,7 @@ class TunePanel(BasePanel):
         """Show what is being done, and a button that ends a search."""
         self.show_activity(activity.text, activity.share, activity.busy)
         searching = activity.text.startswith("search")
-        if self._stop.visible != searching:
-            self._stop.visible = searching
+        change(self._stop, visible=searching)
 
     def show_tries(self, tries: Sequence[Tried], shown: int | None, pinned: int | None) -> None:
         """The scores, and the table. The dropdown goes to a try that is newly shown, else it stays."""
@@ -160,11 +159,10 @@ class TunePanel(BasePanel):
             chosen = self._last_shown = shown
         latest = list(tries)[-_MOST_TRIES:]
         self._names = {f"{t.number}: {changes(first, t.config)}"[:80]: t.number for t in latest[::-1]}
-        if list(self.attempt.options) != list(self._names):
-            self.attempt.options = list(self._names)
+        change(self.attempt, options=tuple(self._names))
         name = next((name for name, number in self._names.items() if number == chosen), None)
-        if name is not None and self.attempt.value != name:
-            self.attempt.value = name
+        if name is not None:
+            change(self.attempt, value=name)
 
     def chosen_try(self) -> int | None:
         """The try that the dropdown stands at."""
@@ -247,16 +245,12 @@ class KnobWidgets:
     def show(self, config: Config) -> None:
         """Set all widgets to a configuration's values."""
         for name, knob in self._knobs.items():
-            value = shown_value(knob, config)
-            if self._handles[name].value != value:
-                self._handles[name].value = value
+            change(self._handles[name], value=shown_value(knob, config))
 
     def follow(self, config: Config) -> None:
         """Show the widgets of parameters that have an effect under this configuration, hide the others."""
         for name, knob in self._knobs.items():
-            visible = knob.applies(config)
-            if self._handles[name].visible != visible:
-                self._handles[name].visible = visible
+            change(self._handles[name], visible=knob.applies(config))
 
 
 def shown_value(knob: Knob, config: Config) -> Any:

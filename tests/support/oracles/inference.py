@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from oracles.forward import Noise
 from oracles.traversal import segments
 from taichi_mrf.config.sections import InferenceConfig
+from taichi_mrf.inference.ray_list import CLEAR_VOXELS
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits
-from taichi_mrf.inference.sum_product import CLEAR_VOXELS
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.forward import SUPPORT
 
