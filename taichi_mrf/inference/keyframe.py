@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.resident import Resident, on_host, resident, unfilled
+from taichi_mrf.kernels.resident import Resident, on_host, resident, zeros
 from taichi_mrf.kernels.types import I32, F32Array, I32Array
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
@@ -195,8 +195,8 @@ class RayList(Bundle):
     def empty(rays: int, groups: int) -> "RayList":
         """A list with room for so many."""
         n, g = max(1, rays), max(1, groups)
-        blocks, group_blocks, first = (unfilled(np.int32, size) for size in (n, g, g + 1))
-        depth, last, support = (unfilled(np.float32, size) for size in (n, n, g))
+        blocks, group_blocks, first = (zeros(np.int32, size) for size in (n, g, g + 1))
+        depth, last, support = (zeros(np.float32, size) for size in (n, n, g))
         return RayList(blocks, depth, last, rays, group_blocks, first, support, groups, 1)
 
     @property

@@ -17,7 +17,7 @@ from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
 from taichi_mrf.inference.surface_rays import SCALE, AddDistances, Band, DistanceSums
 from taichi_mrf.inference.workers import workers_without_trace
-from taichi_mrf.kernels.resident import on_host, unfilled
+from taichi_mrf.kernels.resident import on_host, zeros
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.distance_field import DistanceField
@@ -92,9 +92,7 @@ class SurfaceRays:
         between: Callable[[], object],
     ) -> NDArray[np.float32]:
         """Weight, distance and excess, both times weight, in some bricks: (3, n, 512)."""
-        arrays = [unfilled(np.int64, len(bricks) * VOXELS) for _ in range(3)]
-        for array in arrays:
-            array.fill(0)
+        arrays = [zeros(np.int64, len(bricks) * VOXELS) for _ in range(3)]
         sums = DistanceSums(*arrays)
         keys = grid_keys(bricks)
         order = np.argsort(keys)

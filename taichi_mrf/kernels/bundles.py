@@ -18,8 +18,7 @@ methods:
 
 Taichi itself sees a kernel with one argument for each field: grouping changes neither the compiled code nor
 its speed. (Taichi 1.7.4's own argument packs take no NumPy arrays and one device buffer for each call; its
-structs as arguments take no arrays, are 40% slower on Vulkan, and round differently on a CPU. To hand over a
-matrix costs 60 us a launch, its nine numbers 10 us, so it is taken apart as long as there is room.)
+structs as arguments take no arrays, are 40% slower on Vulkan, and round differently on a CPU.)
 
 What a bundle *is* decides what is compiled: a kernel that is called with another class of bundle in the same
 place is compiled anew, with that class's methods. Such a class is how a sensor plugs into all kernels.
@@ -33,10 +32,8 @@ import linecache
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numpy as np
-
 from taichi_mrf.kernels import quick_start
-from taichi_mrf.kernels.types import Mat3, Template
+from taichi_mrf.kernels.types import Template
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import ti
 
@@ -53,21 +50,12 @@ setattr(Bundle, compiler.function_mark(), False)  # Taichi would warn where a ke
 compiler.pass_whole(Bundle)
 
 
-MOST_ARGUMENTS = 64
-"""Taichi 1.7.4 takes no kernel with more."""
-
-
 class _Flat:
     """A Taichi kernel with one argument for each field, made for one combination of classes of bundles."""
 
-    def __init__(
-        self, body: Callable[..., None], types: dict[str, Any], arguments: tuple[Any, ...], number: int
-    ) -> None:
-        """``number`` of the fields of the ``arguments`` of a ``body`` with these ``types``."""
+    def __init__(self, body: Callable[..., None], types: dict[str, Any], arguments: tuple[Any, ...]) -> None:
         self._names: dict[str, Any] = {"_body": ti.func(body)}
         self._parameters: list[str] = []
-        self._vectors: list[int] = []
-        self._room = MOST_ARGUMENTS - number
         grouped = [
             self._regroup(name, annotation, value)
             for (name, annotation), value in zip(types.items(), arguments, strict=True)
@@ -77,13 +65,7 @@ class _Flat:
         file = f"<{body.__module__}.{body.__name__} for {id(self)}>"
         linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
         exec(compile(source, file, "exec"), self._names)
-        self._kernel = ti.kernel(self._names[body.__name__])
-
-    def launch(self, arguments: list[Any]) -> None:
-        """Launch the kernel with the fields of all bundles."""
-        for at in self._vectors:
-            arguments[at : at + 1] = np.ravel(arguments[at]).tolist()
-        self._kernel(*arguments)
+        self.kernel = ti.kernel(self._names[body.__name__])
 
     def _regroup(self, name: str, annotation: Any, value: Any) -> str:
         """The expression that makes an argument of the body from the flat parameters."""
@@ -93,18 +75,9 @@ class _Flat:
             fields = dataclasses.fields(value)  # type: ignore[arg-type]
             inner = [self._regroup(f"{name}_{f.name}", f.type, getattr(value, f.name)) for f in fields]
             return f"{cls}({', '.join(inner)})"
-        of = f"_type_{name}"
-        self._names[of] = annotation
-        size = annotation.n * annotation.m if isinstance(annotation, type(Mat3)) else 0
-        if size == 0 or size - 1 > self._room:
-            self._parameters.append(f"{name}: {of}")
-            return name
-        self._room -= size - 1
-        self._vectors.append(len(self._parameters))
-        self._names[f"_number_{name}"] = annotation.dtype
-        numbers = [f"{name}_{k}" for k in range(size)]
-        self._parameters += [f"{number}: _number_{name}" for number in numbers]
-        return f"{of}({', '.join(numbers)})"
+        self._names[f"_type_{name}"] = annotation
+        self._parameters.append(f"{name}: _type_{name}")
+        return name
 
 
 Body = TypeVar("Body", bound=Callable[..., None])
@@ -130,8 +103,8 @@ def kernel(body: Body) -> Body:
             _flatten(argument, classes, flat)
         key = tuple(classes)
         if key not in made:
-            made[key] = _Flat(body, types, arguments, len(flat))
-        made[key].launch(flat)
+            made[key] = _Flat(body, types, arguments).kernel
+        made[key](*flat)
 
     launch.__name__, launch.__doc__, launch.__module__ = body.__name__, body.__doc__, body.__module__
     return launch

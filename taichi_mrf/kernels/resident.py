@@ -29,10 +29,10 @@ def resident(values: NDArray[Any]) -> Resident:
     return array
 
 
-def unfilled(dtype: DTypeLike, length: int) -> Resident:
-    """An array (length) for a kernel to fill. On a CPU it is NumPy's: Taichi's is filled with zeros."""
+def zeros(dtype: DTypeLike, length: int) -> Resident:
+    """An array (length) of zeros for kernels to write to; on a CPU it is NumPy's, which is made sooner."""
     if runtime.active() == "cpu":
-        return np.empty(length, dtype)
+        return np.zeros(length, dtype)
     return ti.ndarray(compiler.data_type(np.dtype(dtype)), length)
 
 
