@@ -173,3 +173,15 @@ def test_only_finite_positive_depths_are_measurements() -> None:
         clean = checked_depth(depth, camera_of(len(values), 1), 0.1)
         assert clean.dtype == np.float32
         np.testing.assert_array_equal(clean, [[1.5] + [0.0] * 8])
+
+
+def test_only_finite_depths_from_the_least_one_on_are_measurements() -> None:
+    camera = PinholeCamera(7, 1, 5.0, 5.0, 3.0, 0.0)
+    for kind in (np.float32, np.float64):
+        with np.errstate(over="ignore"):
+            depth = np.array([[0.5, 0.4999, np.inf, -1.0, np.nan, 1e300, 2.0]]).astype(kind)
+        found = checked_depth(depth, camera, 0.5)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, np.float32([[0.5, 0, 0, 0, 0, 0, 2.0]]))
+    zeros = checked_depth(np.zeros((1, 7)) * -1.0, camera, 0.0)
+    assert not np.signbit(zeros).any()
