@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from taichi_mrf.evaluation.accuracy import OUTLIERS, JudgedView
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
-from taichi_mrf.queries.survey import OPAQUE, Occlusion, occlusion, stopped_share
+from taichi_mrf.queries.survey import OPAQUE, Occlusion, dim, occlusion
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
@@ -140,10 +139,7 @@ class _Predicted(Bundle):
 @ti.func
 def _predict_voxel(ray: Template, predicted: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray, whose segment in it reaches from axial depth ``near`` to ``far``."""
-    alpha = occlusion(predicted.belief[voxel], predicted.occlusion)
-    thickness = alpha * (far - near) * ray.voxels_per_depth
-    here = ray.visibility * stopped_share(thickness)
-    ray.visibility *= exp_of_negative(-thickness)
+    here = dim(ray, occlusion(predicted.belief[voxel], predicted.occlusion), near, far)
     sigma = predicted.noise.sigma(0.5 * (near + far))
     high = (ray.measured - near - predicted.noise.bias(near)) / sigma
     low = (ray.measured - far - predicted.noise.bias(far)) / sigma

@@ -25,9 +25,8 @@ from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import log_density
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template
-from taichi_mrf.queries.survey import OPAQUE, Medium, occlusion, stopped_share
+from taichi_mrf.queries.survey import OPAQUE, Medium, dim, occlusion
 from taichi_mrf.queries.view import viewed_box
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
@@ -166,24 +165,22 @@ class _Explaining(Bundle):
     noise: Template  # of the ray's pixel
     factors: F32Array
     measured: F32
-    voxels_per_depth: F32
     i: I32
     out: _Densities
 
 
 @ti.dataclass
 class _Seen(Struct):
-    """What is left of a ray."""
+    """A ray on its way from the camera."""
 
-    visibility: F32
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
+    visibility: F32  # what is left of it
 
 
 @ti.func
 def _explain_voxel(ray: Template, given: Template, voxel: I32, near: F32, far: F32) -> I32:
-    """One voxel of a ray, as survey.survey_voxel has it."""
-    thickness = occlusion(given.belief[voxel], given.medium.occlusion) * (far - near) * given.voxels_per_depth
-    here = ray.visibility * stopped_share(thickness)
-    ray.visibility *= exp_of_negative(-thickness)
+    """One voxel of a ray."""
+    here = dim(ray, occlusion(given.belief[voxel], given.medium.occlusion), near, far)
     noise = given.noise
     for k in range(given.factors.shape[0]):
         noise.sigma_terms = given.factors[k] * given.noise.sigma_terms
@@ -204,10 +201,8 @@ def _explain_rays(
         path = pixel_ray(sensor, view, u, v)
         begin, end = 0.0, medium.max_depth
         clip(path, begin, end, space.lower, space.upper)
-        given = _Explaining(
-            belief, medium, sensor, sensor.noise_at(u, v), factors, measured[i], path.direction.norm(), i, out
-        )
-        ray = _Seen(1.0)
+        given = _Explaining(belief, medium, sensor, sensor.noise_at(u, v), factors, measured[i], i, out)
+        ray = _Seen(path.direction.norm(), 1.0)
         walk_voxels(path, begin, end, space, _explain_voxel, ray, given)
         out.visibility[i] = ray.visibility
 

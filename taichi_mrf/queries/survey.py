@@ -157,6 +157,16 @@ class _Surveyed(Bundle):
 
 
 @ti.func
+def dim(ray: Template, alpha: F32, near: F32, far: F32) -> F32:
+    """Renew a ray's visibility, eq. 15, behind a voxel of density ``alpha``, per voxel size, in which it is
+    from depth ``near`` to ``far``; returns the chance that its surface lies there, eq. 16."""
+    thickness = alpha * (far - near) * ray.voxels_per_depth
+    here = ray.visibility * stopped_share(thickness)
+    ray.visibility *= exp_of_negative(-thickness)
+    return here
+
+
+@ti.func
 def survey_voxel(ray: Template, surveyed: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray, whose segment in it reaches from depth ``near`` to ``far``."""
     log_odds = surveyed.belief[voxel]
@@ -167,10 +177,7 @@ def survey_voxel(ray: Template, surveyed: Template, voxel: I32, near: F32, far: 
         ray.omega = omega
         ray.near = near
         ray.far = far
-    # Eqs. 15 and 16.
-    thickness = alpha * (far - near) * ray.voxels_per_depth
-    here = ray.visibility * stopped_share(thickness)
-    ray.visibility *= exp_of_negative(-thickness)
+    here = dim(ray, alpha, near, far)
     ray.stopped += here
     ray.moment += here * 0.5 * (near + far)
     if ti.static(surveyed.judged):

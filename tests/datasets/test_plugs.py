@@ -3,7 +3,6 @@ source is opened."""
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from console import FAST, mapped, report_of
+from pages import code_of
 
 from taichi_mrf.datasets.entries import FORMATS
 from taichi_mrf.datasets.registry import GROUP, OWN, plugs
@@ -51,7 +51,7 @@ def installed(folder: Path, package: str, plug: str, place: str, module: str = "
 def documented(repository: Path) -> str:
     """The module of the example."""
     section = (repository / "data" / "README.md").read_text("utf-8").partition("## A format of your own")[2]
-    return re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)[0]
+    return code_of(section)[0]
 
 
 def walk(folder: Path) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from console import taichi_mrf
+from pages import code_of
 
 SIZE = ("frames=30&width=160&height=120", "frames=12&width=80&height=60")
 VOXELS = ("0.02", "0.1")
@@ -16,8 +17,7 @@ VOXELS = ("0.02", "0.1")
 def blocks(repository: Path, page: str, kind: str) -> list[str]:
     """The page's blocks of code of a kind, "python" or, of shell commands, "", made small."""
     text = (repository / "docs" / page).read_text(encoding="utf-8")
-    found = re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    return [code.replace(*SIZE).replace(*VOXELS) for each, code in found if each == kind]
+    return [code.replace(*SIZE).replace(*VOXELS) for code in code_of(text, kind)]
 
 
 @pytest.mark.usefixtures("one_backend")

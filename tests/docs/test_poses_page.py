@@ -1,10 +1,10 @@
 """The examples of docs/poses.md that solve a pose graph, on a loop whose solution is a closed form."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import code_of
 
 from taichi_mrf.datasets.pose_sources.graph_file import read_pose_graph
 from taichi_mrf.geometry.poses import Pose
@@ -28,9 +28,7 @@ def edge(first: int, second: int, x_m: float, sigma: float) -> str:
 
 def examples(repository: Path) -> list[str]:
     page = (repository / "docs" / "poses.md").read_text(encoding="utf-8")
-    return [
-        found for found in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "solve_pose_graph" in found
-    ]
+    return [found for found in code_of(page) if "solve_pose_graph" in found]
 
 
 def test_a_graph_in_a_file_is_solved_and_a_wrong_loop_named(

@@ -1,17 +1,17 @@
 """The README: its first screen, and its first example as a user pastes it."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
 
+from pages import code_of
+
 
 def test_the_example_runs(tmp_path: Path, repository: Path) -> None:
     text = (repository / "README.md").read_text(encoding="utf-8")
-    example = re.search(r"```python\n(.*?)```", text, re.DOTALL)
-    assert example is not None
+    example = code_of(text)[0]
     # The same room on fewer pixels, and a folder that may be written to.
-    program = example[1].replace("frames=20", "frames=4&width=160&height=120")
+    program = example.replace("frames=20", "frames=4&width=160&height=120")
     program = program.replace('"map.npz"', repr(str(tmp_path / "map.npz")))
     assert program.count(str(tmp_path)) == program.count("width=160") == 1
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

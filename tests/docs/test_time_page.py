@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from pages import code_of
 
 from taichi_mrf.config.sections import TimeConfig
 
@@ -20,7 +21,7 @@ def test_the_examples_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+    for example in code_of(page):
         exec(example.replace('tm.init("cpu")\n', ""), names)  # what the page tells people to run
     appeared, vanished, new, gone = (
         int(number) for number in re.findall(r"\d+", capsys.readouterr().out.split("\n", 1)[1])

@@ -1,10 +1,10 @@
 """The examples of docs/queries.md, pasted one after the other."""
 
-import re
 from pathlib import Path
 
 import pytest
 from ball_room import room_that_changed
+from pages import code_of
 from queried_maps import room_map
 
 import taichi_mrf
@@ -23,7 +23,7 @@ def test_the_examples_run(
 ) -> None:
     room_map("mrf").save(tmp_path / "map.npz")
     monkeypatch.chdir(tmp_path)
-    examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    examples = code_of(page)
     assert len(examples) == 15
     names: dict[str, object] = {}
     for example in examples:
@@ -42,7 +42,7 @@ def test_the_examples_run_on_every_layer(
     monkeypatch.setattr(taichi_mrf, "load_map", lambda path: layer)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+    for example in code_of(page):
         if "m.calibrated(" not in example:  # which needs the keyframes of a whole map
             exec(example, names)
     assert (tmp_path / "room.bt").stat().st_size > 0
