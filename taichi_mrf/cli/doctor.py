@@ -38,8 +38,7 @@ def run_doctor(options: Doctor) -> int:
             raise
         dataset = open_posed(options.source, options.poses, color=False, **reading)
     found = diagnose(dataset, said)
-    if options.picture is not None:
-        _write_picture(options.picture, found)
+    drawn = options.picture is None or _write_picture(options.picture, found)
     if options.json:
         facts = {
             "findings": [{"text": each.text, "flag": each.flag} for each in found.findings],
@@ -50,6 +49,8 @@ def run_doctor(options: Doctor) -> int:
         print(json.dumps(facts, indent=2))
     else:
         _print(Terminal(), found, options)
+        if not drawn:
+            Terminal().print_line(f"{options.picture} is not written: no two frames see enough of the same.")
     return SOMETHING_TO_MEND if found.findings else 0
 
 
@@ -73,9 +74,12 @@ def _print(console: Terminal, found: Diagnosis, options: Doctor) -> None:
         console.print_line(" ".join(words))
 
 
-def _write_picture(path: Path, found: Diagnosis) -> None:
+def _write_picture(path: Path, found: Diagnosis) -> bool:
+    """False if there is nothing to draw."""
     picture = overlap(found)
-    if picture is not None:
-        png = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1]
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(png.tobytes())
+    if picture is None:
+        return False
+    png = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png.tobytes())
+    return True

@@ -82,7 +82,7 @@ def window_around(
     """
     if volume.lower is not None and volume.upper is not None:
         lower_m, upper_m = np.maximum(lower_m, volume.lower), np.minimum(upper_m, volume.upper)
-    if (lower_m >= upper_m).any():
+    if (lower_m > upper_m).any():
         return None
     window = Window.covering(lower_m, upper_m, voxel_size)
     if window.cells >= 2**31:

@@ -227,6 +227,10 @@ def test_the_flags_that_are_named_mend_a_recording(
     assert green[:half].sum() < 0.2 * green[half:].sum()
     assert carry_out("doctor", folder, *flags) == 0
     assert capsys.readouterr().out.startswith("Nothing odd was found.")
+    alone = tmp_path / "alone.png"
+    assert carry_out("doctor", "synthetic:room?frames=2&width=80&height=60", "--picture", alone) == 0
+    assert f"{alone} is not written: no two frames" in capsys.readouterr().out
+    assert not alone.exists()
     # What was said of it and is not so is a mistake too.
     wrong = ("--poses-are", "inverse,opengl,wxyz", "--depth-scale", "1000")
     assert carry_out("doctor", folder, *wrong, "--json") == 4

@@ -20,6 +20,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
 from taichi_mrf.queries.contradiction import ray_scores
 from taichi_mrf.queries.gain import pixel_gain, view_gain
+from taichi_mrf.queries.points import FREE
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.sensor.origins import points_at
@@ -107,6 +108,17 @@ def test_columns_that_are_all_moved_alike_make_the_map_of_the_moved_sensor(make:
     np.testing.assert_allclose(
         pixel_gain(one, moving, T, 4.0), pixel_gain(other, STILL, T @ step, 4.0), atol=1e-3
     )
+
+
+@pytest.mark.parametrize("make", MAPS.values(), ids=MAPS)
+@pytest.mark.parametrize("directions", [[[0, 0, 1.0]], [[1.0, 0, 0], [0, 1.0, 0]]], ids=["line", "plane"])
+def test_rays_in_one_line_or_plane_along_the_axes_are_mapped(
+    make: Callable[[], Any], directions: list[list[float]]
+) -> None:
+    sensor, m = RayTable(directions), make()
+    m.add_keyframe(np.full(sensor.shape, 1.0, np.float32), np.eye(4), sensor)
+    m.infer()
+    assert (m.state(0.5 * np.array(directions)) == FREE).all()
 
 
 @pytest.mark.parametrize("make", MAPS.values(), ids=MAPS)

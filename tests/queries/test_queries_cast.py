@@ -97,6 +97,8 @@ def test_no_rays_and_rays_far_away(hand: HandMap) -> None:
     for unknown, hit, range_m in (("free", False, 1.0), ("stop", False, 0.0), ("hit", True, 0.0)):
         far = cast_rays(hand, [[1000.0, 0, 0]], [[1.0, 0, 0]], 1.0, unknown)  # type: ignore[arg-type]
         assert (far.hit[0], far.range[0]) == (hit, range_m)
+        beside = cast_rays(hand, [[0.0, 0, 0], [1000.0, 0, 0]], [[1.0, 0, 0]] * 2, 1.0, unknown)  # type: ignore[arg-type]
+        assert (beside.hit[1], beside.range[1]) == (hit, range_m)
 
 
 @pytest.mark.usefixtures("backend")
