@@ -123,10 +123,6 @@ class Knob:
         """True if the parameter changes anything under this configuration."""
         return self.method in (None, config.method) and self.counts(config)
 
-    def value_of(self, config: Config) -> Any:
-        """The parameter's value."""
-        return self.parameter.value_of(config)
-
 
 def _knobs_of(method: Method) -> list[Knob]:
     """A method's sliders, which name fields of its section."""
@@ -134,20 +130,14 @@ def _knobs_of(method: Method) -> list[Knob]:
     def counts(slider: Slider) -> Callable[[Config], bool]:
         return lambda config: slider.counts(getattr(config, method.section))
 
+    section = method.section
     return [
         Knob(
-            f"{method.section}.{slider.name}",
-            method.section,
-            slider.range,
-            slider.unit,
-            slider.decades,
-            method.name,
-            counts(slider),
-            slider.by_factors,
-            slider.searched,
+            f"{section}.{each.name}", section, each.range, each.unit, each.decades, method.name, counts(each),
+            each.by_factors, each.searched,
         )
-        for slider in method.sliders
-    ]
+        for each in method.sliders
+    ]  # fmt: skip
 
 
 def _has_no_table(of: str) -> Callable[[Config], bool]:
