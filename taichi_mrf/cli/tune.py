@@ -41,7 +41,7 @@ def run_tune(options: Tune) -> int:
         from taichi_mrf.errors import DatasetError
         from taichi_mrf.session.session_core import Policy
         from taichi_mrf.system import runtime
-        from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
+        from taichi_mrf.tune.search import Search
         from taichi_mrf.tune.session import TuneSession
 
         runtime.init(settings.runtime.arch, settings.runtime.threads)
@@ -58,8 +58,9 @@ def run_tune(options: Tune) -> int:
             _tell_noise(options, settings, learnt, print_line)
         search = None
         if options.auto is not None:
-            names = options.names or DEFAULT_SEARCH
-            search = Search(settings, names, options.auto, options.seed, options.search_stride)
+            search = Search(
+                settings, options.names, options.auto, options.seed, options.search_stride, options.objective
+            )
         printed: set[int] = set()
         session = TuneSession(
             dataset,
@@ -70,7 +71,7 @@ def run_tune(options: Tune) -> int:
             search=search,
             listening=lambda where: print_address(where, "The page", options.port, options.open, print_line),
             tried=lambda attempt: _print_trial(attempt, session.search, printed, print_line),
-            judged=lambda verdict: _print_verdict(session, print_line),
+            judged=lambda lines: _print_verdict(lines, print_line),
         )
         for note in dataset.notes:
             print_line(note)
@@ -129,23 +130,15 @@ def _finish(session: "TuneSession", options: Tune, print_line: PrintLine) -> Non
         return
     write_text(options.out / TABLE_FILE, session.history.to_csv())
     print_line(f"wrote {options.out / TABLE_FILE}")
-    best = session.search.best if session.search is not None else None
-    attempt = next((each for each in session.history.attempts if each.config == best), None)
-    if attempt is not None:
-        write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(_verdict(session))))
+    best = session.best_yaml()
+    if best is not None:
+        write_text(options.out / BEST_FILE, best)
         print_line(f"wrote {options.out / BEST_FILE}")
 
 
-def _verdict(session: "TuneSession") -> list[str]:
-    """The gain of the search on views that it has not used, line by line; empty until it has ended."""
-    from taichi_mrf.tune.trial import verdict_lines
-
-    return verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
-
-
-def _print_verdict(session: "TuneSession", print_line: PrintLine) -> None:
+def _print_verdict(lines: list[str], print_line: PrintLine) -> None:
     """Print the verdict as soon as the search has ended; the page stays up."""
-    for line in _verdict(session):
+    for line in lines:
         print_line(line)
 
 

@@ -53,23 +53,33 @@ class HeldOutPictures:
         shown = self._verdicts[number][view]
         beside = None if reference is None else self._verdicts[reference][view]
         now, then = _verdict(shown[0]), None if beside is None else _verdict(beside[0])
-        change, change_title = None, ""
+        measured = unrolled(frame.camera).image(frame.depth_m)
+        step = _step(measured)
+        depths, change_title = [depth_colors(measured[::step, ::step])], ""
         if then is not None and reference != number and then.shape == now.shape:
             better, worse = (now == RIGHT) & (then != RIGHT), (now != RIGHT) & (then == RIGHT)
             change = np.where(better[..., None], BETTER, np.where(worse[..., None], WORSE, SAME))
-            change_title = f"from A to B: {better.mean():.1%} became right, {worse.mean():.1%} wrong"
-        measured = unrolled(frame.camera).image(frame.depth_m)
-        step = _step(measured)
+            depths.insert(0, change.astype(np.uint8))
+            change_title = f"From A to B: {better.mean():.1%} became right, {worse.mean():.1%} wrong"
         return HeldOutView(
             name=frame.name,
-            measured=depth_colors(measured[::step, ::step]),
-            accuracy=ACCURACY_COLORS[now],
+            accuracy=side_by_side([ACCURACY_COLORS[each] for each in (then, now) if each is not None]),
             title=_title(number, shown),
-            reference=None if then is None else ACCURACY_COLORS[then],
             reference_title="" if beside is None or reference is None else _title(reference, beside),
-            change=None if change is None else change.astype(np.uint8),
+            measured=side_by_side(depths),
             change_title=change_title,
         )
+
+
+def side_by_side(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Pictures (h, w, 3) in a row, each as large as the largest, with white between them."""
+    tall, wide = max(picture.shape[:2] for picture in pictures)
+    between = np.full((tall, 1 + wide // 40, 3), 255, np.uint8)
+    row: list[NDArray[np.uint8]] = []
+    for picture in pictures:
+        large = cv2.resize(picture, (wide, tall), interpolation=cv2.INTER_NEAREST)
+        row += [between, large.astype(np.uint8)]
+    return np.concatenate(row[1:], axis=1)
 
 
 def residuals_of(number: int, views: Sequence[JudgedView]) -> Residuals:
@@ -123,7 +133,7 @@ def _verdict(packed: bytes) -> NDArray[np.uint8]:
 
 
 def _title(number: int, shown: tuple[bytes, float, float]) -> str:
-    return f"try {number}: right {shown[1]:.1%} within 1.5 sigma, no surface {shown[2]:.1%}"
+    return f"try {number}: right {shown[1]:.1%} within 1.5 voxels, no surface {shown[2]:.1%}"
 
 
 def _step(image: NDArray[np.generic]) -> int:

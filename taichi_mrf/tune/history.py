@@ -4,12 +4,13 @@ import csv
 import dataclasses
 import io
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Literal
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.viewer.tune.messages import By, Scores, Tried, figures, scores_in_words
+from taichi_mrf.viewer.tune.messages import By, Scores, Tried, scores_in_words
 
 TABLE_FILE = "tries.csv"
 BEST_FILE = "best.yaml"
@@ -98,8 +99,8 @@ class History:
         table = csv.writer(text, lineterminator="\n")
         table.writerow(["try", "by", "reference", *names, *kinds])
         for each in self.attempts:
-            values = [_plain(value_of(each.config, name)) for name in names]
-            scores = figures(each.scores)
+            values = [_plain(attrgetter(name)(each.config)) for name in names]
+            scores = dataclasses.asdict(each.scores)
             is_reference = int(each.number == self.pinned)
             table.writerow([each.number, each.by, is_reference, *values, *(scores[kind] for kind in kinds)])
         return text.getvalue()
@@ -111,16 +112,8 @@ class History:
             return ["The parameters are those that tuning began with."]
         return [
             "Changed from where tuning began:",
-            *(f"  {n}: {value_of(attempt.config, n)} (was {value_of(first, n)})" for n in changed),
+            *(f"  {n}: {attrgetter(n)(attempt.config)} (was {attrgetter(n)(first)})" for n in changed),
         ]
-
-
-def value_of(config: Config, name: str) -> Any:
-    """The value of a parameter by its dotted name, a polynomial as a whole."""
-    value: Any = config
-    for field in name.split("."):
-        value = getattr(value, field)
-    return value
 
 
 def _plain(value: Any) -> Any:

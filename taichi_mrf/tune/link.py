@@ -7,9 +7,9 @@ from multiprocessing.connection import Connection
 from taichi_mrf.session.link import ViewerLink
 from taichi_mrf.session.outbox import Outbox, Waiting, WaitingBricks
 from taichi_mrf.viewer.messages import Hello, KeyframeInfo, Request, Update
-from taichi_mrf.viewer.tune.messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
+from taichi_mrf.viewer.tune import messages as t
 
-LATEST_ONLY = (Tuning, Activity, Pinned, Chosen, Residuals, HeldOutView)
+LATEST_ONLY = (t.Tuning, t.Activity, t.Pinned, t.Chosen, t.Residuals, t.HeldOutView, t.Verdict)
 
 
 class TuneOutbox(Outbox):
@@ -19,14 +19,14 @@ class TuneOutbox(Outbox):
         """Every try waits in a place of its own."""
         if isinstance(update, LATEST_ONLY):
             return type(update).__name__
-        if isinstance(update, Tried):
+        if isinstance(update, t.Tried):
             return "try", update.number
         return super().key(update)
 
     def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
         """Other frames make tries pointless, another map what is of the map."""
-        if isinstance(update, Tuning):
-            return lambda waiting: not isinstance(waiting, (*LATEST_ONLY, Tried))
+        if isinstance(update, t.Tuning):
+            return lambda waiting: not isinstance(waiting, (*LATEST_ONLY, t.Tried))
         if isinstance(update, Hello):
             return lambda waiting: not isinstance(waiting, KeyframeInfo | Hello | WaitingBricks)
         return None

@@ -1,8 +1,8 @@
-"""The automatic search: which parameters to try next, so that held-out measurements become likelier.
+"""The automatic search: which parameters to try next, so that a score of the held-out views improves.
 
 The search itself is Optuna's tree-structured Parzen estimator (Bergstra et al., NIPS 2011), which comes with
-the extra ``auto``. What is maximised is the log-likelihood of the held-out measurements under map and noise
-together: a sigma that is too small makes measured values improbable, one that is too large spreads the
+the extra ``auto``. By default it maximises the log-likelihood of the held-out measurements under map and
+noise together: a sigma that is too small makes measured values improbable, one that is too large spreads the
 density.
 """
 
@@ -17,6 +17,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
+from taichi_mrf.viewer.tune.messages import HEADLINE, Objective
 
 SIGMA_SCALE = "sensor.sigma_scale"
 """The factor on every stated sigma. The page has no slider for it: it shows the coefficients themselves."""
@@ -60,19 +61,28 @@ class Search:
     """
 
     def __init__(
-        self, start: Config, names: Sequence[str], tries: int, seed: int, pixel_stride: int = 0
+        self,
+        start: Config,
+        names: Sequence[str],
+        tries: int,
+        seed: int,
+        pixel_stride: int = 0,
+        objective: Objective = "fit",
     ) -> None:
-        """The first try is the configuration ``start`` itself, so that the best is never worse.
-        Raises ConfigError for names that cannot be searched, and if Optuna is not installed."""
+        """Without ``names`` it searches those default ones that count under ``start``, which itself is the
+        first try, so that the best is never worse. Raises ConfigError for names that cannot be searched, and
+        if Optuna is not installed."""
         self.start, self.tries, self.told, self.pixel_stride = start, tries, 0, pixel_stride
         self.best: Config | None = None
-        self.best_log_likelihood = -math.inf
+        self.objective, self._best_value = HEADLINE[objective], math.nan
+        names = names or [n for n in DEFAULT_SEARCH if n == SIGMA_SCALE or _knob(n).applies(start)]
         self._dimensions = dimensions(names, start)
-        optuna = _optuna()
+        optuna: Any = library("optuna", "--auto needs", "auto", ConfigError)
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._failed = optuna.trial.TrialState.FAIL
         self._study = optuna.create_study(
-            direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True)
+            direction="maximize" if self.objective.better == "higher" else "minimize",
+            sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True),
         )
         self._study.enqueue_trial({each.name: _value_of(start, each) for each in self._dimensions})
         self._asked: tuple[Any, Config] | None = None
@@ -96,21 +106,20 @@ class Search:
                 self._asked = trial, config
         return self._asked[1]
 
-    def tell(self, log_likelihood: float) -> None:
-        """The log-likelihood of the last parameters; NaN if they could not be mapped or judged."""
+    def tell(self, value: float) -> None:
+        """The objective's value for the last parameters; NaN if they could not be mapped or judged."""
         assert self._asked is not None
         (trial, config), self._asked = self._asked, None
         self.told += 1
-        if math.isfinite(log_likelihood):
-            self._study.tell(trial, log_likelihood)
-            if log_likelihood > self.best_log_likelihood:
-                self.best, self.best_log_likelihood = config, log_likelihood
+        if math.isfinite(value):
+            self._study.tell(trial, value)
+            better = (
+                value > self._best_value if self.objective.better == "higher" else value < self._best_value
+            )
+            if self.best is None or better:
+                self.best, self._best_value = config, value
         else:
             self._study.tell(trial, state=self._failed)
-
-
-def _optuna() -> Any:
-    return library("optuna", "--auto needs", "auto", ConfigError)
 
 
 def _dimension(name: str, start: Config) -> Dimension:
@@ -149,14 +158,14 @@ def _suggest(trial: Any, dimension: Dimension) -> Scalar:
         chosen = trial.suggest_int(dimension.name, int(dimension.least), int(dimension.most))
     else:
         value = trial.suggest_float(dimension.name, dimension.least, dimension.most, log=dimension.log)
-        chosen = _rounded(value)
+        chosen = float(f"{value:.4g}")  # more digits count for nothing
     return chosen
 
 
 def _value_of(config: Config, dimension: Dimension) -> Scalar:
     """The start value of a parameter, clipped to its range."""
     scale = dimension.name == SIGMA_SCALE
-    value: Scalar = config.sensor.sigma_scale if scale else _knob(dimension.name).value_of(config)
+    value: Scalar = config.sensor.sigma_scale if scale else _knob(dimension.name).parameter.value_of(config)
     if dimension.choices:
         return value
     within = min(max(float(value), dimension.least), dimension.most)
@@ -168,8 +177,3 @@ def _with_value(config: Config, dimension: Dimension, value: Scalar) -> Config:
         sensor = dataclasses.replace(config.sensor, sigma_scale=float(value))
         return dataclasses.replace(config, sensor=sensor)
     return _knob(dimension.name).parameter.replaced(config, value)
-
-
-def _rounded(value: float) -> float:
-    """Rounded to four significant digits, which is all that counts."""
-    return float(f"{value:.4g}")

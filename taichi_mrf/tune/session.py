@@ -19,25 +19,13 @@ from taichi_mrf.session.session_core import Policy, SessionCore
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures, residuals_of
-from taichi_mrf.tune.history import Attempt, History
+from taichi_mrf.tune.history import BEST_FILE, Attempt, History
 from taichi_mrf.tune.search import Search
-from taichi_mrf.tune.trial import Judged, Trial, contenders, judge_unseen, run_trial
+from taichi_mrf.tune.trial import Trial, contenders, judge_unseen, run_trial, verdict_lines
 from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
 from taichi_mrf.viewer.messages import File, Hello, Listening, Notice, Quit
-from taichi_mrf.viewer.tune.messages import (
-    Activity,
-    By,
-    ChooseFrames,
-    Chosen,
-    FrameChoice,
-    LookAt,
-    Pin,
-    Pinned,
-    SaveTries,
-    StopSearch,
-    Try,
-    Tuning,
-)
+from taichi_mrf.viewer.tune import messages as t
+from taichi_mrf.viewer.tune.messages import By, FrameChoice
 
 
 class TuneSession(SessionCore):
@@ -56,27 +44,27 @@ class TuneSession(SessionCore):
         search: Search | None = None,
         listening: Callable[[Listening], None] = lambda where: None,
         tried: Callable[[Attempt], None] = lambda attempt: None,
-        judged: Callable[[list[Judged]], None] = lambda verdict: None,
+        judged: Callable[[list[str]], None] = lambda verdict: None,
     ) -> None:
         """Reads the working set and sends it to the page. ``search`` is carried out first. ``listening`` is
-        called with the address of the page, ``tried`` after each try, ``judged`` with the scores on unseen
-        views once the search has ended. Raises TaichiMRFError."""
+        called with the address of the page, ``tried`` after each try, ``judged`` with the verdict, line by
+        line, once the search has ended. Raises TaichiMRFError."""
         super().__init__(link, policy)
         self._dataset, self._config = dataset, config
-        self.search, self._tried, self._judged = search, tried, judged
-        self.verdict: list[Judged] = []
-        self._view = 0
+        self._tried, self._judged = tried, judged
+        self._newer = 0
         self._handlers: dict[type, Callable[[Any], None]] = {
             Listening: listening,
-            Try: self._want,
-            Pin: self._pin,
-            LookAt: self._look_at,
-            ChooseFrames: self._choose_frames,
-            SaveTries: self._save,
-            StopSearch: lambda request: self._stop_search(),
+            t.Try: self._want,
+            t.Pin: self._pin,
+            t.LookAt: self._look_at,
+            t.ChooseFrames: self._choose_frames,
+            t.SaveTries: self._save,
+            t.StartSearch: self._start_search,
+            t.StopSearch: lambda request: self._stop_search(),
             Quit: lambda request: self._quit(),
         }
-        self._begin(choice)
+        self._begin(choice, search)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Work until told to stop: by ``should_stop``, by the viewer, or because the link is lost."""
@@ -84,14 +72,14 @@ class TuneSession(SessionCore):
 
     def idle(self) -> float:
         """Show that there is nothing to do; returns for how many seconds to wait at most."""
-        self.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
+        self.send(t.Activity("waiting: all scores are up to date", 1.0, busy=False))
         return super().idle()
 
     def _work(self) -> bool:
         """Do the next piece of work; returns whether there was any."""
         if self._wanted is not None:
             self.guarded(self._try_wanted)
-        elif self.search is not None and not self.search.done:
+        elif self._searching:
             self.guarded(self._search_once)
         elif self.search is not None and self.search.best is not None and not self._is_judged:
             self.guarded(self._judge_found)
@@ -99,20 +87,21 @@ class TuneSession(SessionCore):
             return False
         return True
 
-    def _begin(self, choice: FrameChoice) -> None:
+    def _begin(self, choice: FrameChoice, search: Search | None) -> None:
         """Start on a working set, with an empty table. If it raises, the old one stays."""
-        self.frames: WorkingSet = read_working_set(self._dataset, choice, keep_unseen=self.search is not None)
+        self.frames: WorkingSet = read_working_set(self._dataset, choice, keep_unseen=search is not None)
+        self.search, self._is_judged, self._view = search, search is None, 0
+        self.verdict: list[str] = []
         self.history = History(self.frames.source)
         self._pictures = HeldOutPictures(self.frames.held_out)
         self._publisher = MapPublisher(self.frames.source, self.link)
         self._current: int | None = None
         self._coarse = coarse_stride(self.frames.camera)
-        self._is_judged = self.search is None
-        self._newer = 0
+        self._newer += 1
         self._wanted: tuple[Config, By] | None = (self._config, "start")
         backend = runtime.choice()
         self.send(
-            Tuning(
+            t.Tuning(
                 source=self.frames.source,
                 backend=backend.name if backend else "",
                 device=backend.device if backend else "",
@@ -134,7 +123,7 @@ class TuneSession(SessionCore):
             request = self.waiting.take()
             self.guarded(partial(self._handlers[type(request)], request))
 
-    def _want(self, request: Try) -> None:
+    def _want(self, request: t.Try) -> None:
         self._wanted = request.config, "hand"
         self._newer += 1
 
@@ -143,8 +132,8 @@ class TuneSession(SessionCore):
         began_with = self._newer
 
         def go_on(activity: str, share: float) -> bool:
-            prefix = "" if self.search is None or self.search.done else f"{self._search_text()}: "
-            self.send(Activity(prefix + activity, share, busy=True))
+            prefix = f"{self._search_text()}: " if self._searching else ""
+            self.send(t.Activity(prefix + activity, share, busy=True))
             self._carry_out_requests()
             return self._newer == began_with and not self.is_over
 
@@ -174,7 +163,7 @@ class TuneSession(SessionCore):
             raise
         if trial is None:
             return
-        self.search.tell(trial.scores.log_likelihood)
+        self.search.tell(self.search.objective.value(trial.scores))
         attempt = self._note(trial, "search")
         if self.search.best == config:
             self._show(trial, attempt)
@@ -187,8 +176,18 @@ class TuneSession(SessionCore):
         if self.search.best is not None:
             self._wanted = self.search.best, "search"
 
+    @property
+    def _searching(self) -> bool:
+        return self.search is not None and not self.search.done
+
+    def _start_search(self, request: t.StartSearch) -> None:
+        if self._searching:
+            raise ConfigError("a search is going on: stop it first")
+        search = Search(self._config, (), request.tries, seed=0, objective=request.objective)
+        self._begin(self.frames.choice, search)
+
     def _stop_search(self) -> None:
-        if self.search is not None and not self.search.done:
+        if self.search is not None and self._searching:
             self.search.tries = self.search.told
             self._newer += 1
             self._show_found()
@@ -198,20 +197,24 @@ class TuneSession(SessionCore):
         assert self.search is not None
         assert self.search.best is not None
         compared = contenders(self.search.start, self.search.best)
-        judged = judge_unseen(self.frames, compared, self._go_on())
-        if judged is None:
+        verdict = judge_unseen(self.frames, compared, self._go_on())
+        if verdict is None:
             return
-        self._is_judged, self.verdict = True, judged
-        self._judged(judged)
-        gain = judged[-1].scores.log_likelihood - judged[0].scores.log_likelihood
-        right = judged[-1].scores.accuracy_sigma - judged[0].scores.accuracy_sigma
-        self.send(
-            Notice(
-                f"The search has ended. On {len(self.frames.unseen)} views that were never looked at before, "
-                f"what it found changes the log-likelihood by {gain:+.3f} and the share of right pixels "
-                f"(1.5 sigma) by {100 * right:+.1f} points against the shipped defaults."
-            )
-        )
+        self._is_judged, self.verdict = True, verdict_lines(verdict)
+        self._judged(self.verdict)
+        self.send(verdict)
+        kind, (before, *_, after) = self.search.objective, verdict.scores.values()
+        gain = f"{kind.label} {kind.text(after)}, with shipped defaults {kind.text(before)}"
+        on = f"on {verdict.views} views that were never looked at before"
+        self.send(Notice(f"The search has ended; {on}: {gain}. More is in the tab Search."))
+        if self.policy.out is not None:
+            write_text(self.policy.out / BEST_FILE, self.best_yaml() or "")
+
+    def best_yaml(self) -> str | None:
+        """Text of the file with what the search has found and its verdict; None if it has found nothing."""
+        best = None if self.search is None else self.search.best
+        attempt = next((each for each in self.history.attempts if each.config == best), None)
+        return None if attempt is None else self.history.to_yaml(attempt.number, tuple(self.verdict))
 
     def _search_text(self) -> str:
         assert self.search is not None
@@ -223,7 +226,7 @@ class TuneSession(SessionCore):
         self._pictures.keep(attempt.number, trial.views, trial.scores.pixel_stride, self.history.pinned)
         self.send(attempt.message())
         if attempt.number == self.history.pinned:
-            self.send(Pinned(self.history.pinned))
+            self.send(t.Pinned(self.history.pinned))
         if by != "search" and trial.scores.pixel_stride == self._coarse:  # once is enough
             for text in trial.warnings:
                 self.send(Notice(text, "warning"))
@@ -233,7 +236,7 @@ class TuneSession(SessionCore):
     def _show(self, trial: Trial, attempt: Attempt) -> None:
         """Show map, plot and pictures of a try."""
         self._current = attempt.number
-        self.send(Chosen(attempt.number, attempt.config))
+        self.send(t.Chosen(attempt.number, attempt.config))
         self._publisher.show(trial)
         self.send(residuals_of(attempt.number, trial.views))
         self._send_pictures()
@@ -244,25 +247,30 @@ class TuneSession(SessionCore):
             if shown is not None:
                 self.send(shown)
 
-    def _pin(self, request: Pin) -> None:
+    def _pin(self, request: t.Pin) -> None:
         self.history.pin(request.number)
-        self.send(Pinned(self.history.pinned))
+        self.send(t.Pinned(self.history.pinned))
         self._send_pictures()
 
-    def _look_at(self, request: LookAt) -> None:
+    def _look_at(self, request: t.LookAt) -> None:
         if not 0 <= request.view < len(self.frames.held_out):
             raise ConfigError(f"there is no held-out view {request.view}")
         self._view = request.view
         self._send_pictures()
 
-    def _choose_frames(self, request: ChooseFrames) -> None:
-        if self.search is not None:
-            raise ConfigError("the frames stay those of the search: start anew, without --auto, for others")
-        self._begin(request.choice)
+    def _choose_frames(self, request: t.ChooseFrames) -> None:
+        if self._searching:
+            raise ConfigError("the frames stay those of the search: stop it first")
+        self._begin(request.choice, None)
 
-    def _save(self, request: SaveTries) -> None:
+    def _save(self, request: t.SaveTries) -> None:
         """Send a file to the browser that asked for it; with --out it is also left there."""
-        name, text = self.history.file(request.kind, request.number)
+        if request.kind == "best":
+            name, text = BEST_FILE, self.best_yaml()
+        else:
+            name, text = self.history.file(request.kind, request.number)
+        if text is None:
+            raise ConfigError("the search has found nothing yet")
         if self.policy.out is not None:
             write_text(self.policy.out / name, text)
         self.send(File(name, text.encode(), request.client))
@@ -280,6 +288,7 @@ class MapPublisher:
         self._source, self._link = source, link
         self._shown: Mapper | None = None
         self._hello: Hello | None = None
+        self._names: list[str] = []
 
     def show(self, trial: Trial) -> None:
         """Send a map with its keyframes. If grid, prior and keyframes are those of the map before, only
@@ -289,7 +298,7 @@ class MapPublisher:
         bricks = publisher.changes() or publisher.everything_gone()
         keyframes = [self._shown.describe(entry) for entry in self._shown.roster.entries.values()]
         names = [keyframe.name for keyframe in keyframes]
-        if before is not None and self._hello == hello and _names(before) == names:
+        if before is not None and (self._hello, self._names) == (hello, names):
             gone = [before.shown.publisher.everything_gone()]
         else:
             gone = []
@@ -297,8 +306,4 @@ class MapPublisher:
         for keyframe in keyframes:
             self._link.send(keyframe)
         self._link.send(merged([*gone, bricks]))
-        self._hello = hello
-
-
-def _names(mapper: Mapper) -> list[str]:
-    return [entry.name for entry in mapper.roster.entries.values()]
+        self._hello, self._names = hello, names

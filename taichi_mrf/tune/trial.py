@@ -26,7 +26,7 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.working_set import VoxelTruth, WorkingSet, thinned
-from taichi_mrf.viewer.tune.messages import KINDS, Scores
+from taichi_mrf.viewer.tune.messages import KINDS, Scores, Verdict
 
 SHIPPED, STARTED, FOUND = "shipped defaults", "where the search began", "found"
 
@@ -146,15 +146,6 @@ def _score(
     )
 
 
-@dataclass(frozen=True)
-class Judged:
-    """One line of the verdict."""
-
-    name: str
-    config: Config
-    scores: Scores
-
-
 def contenders(start: Config, found: Config) -> list[tuple[str, Config]]:
     """The configurations to compare: the shipped defaults with the same voxel size, method and density of
     outliers, which is the recording's, the start of the search if it differs, and the result."""
@@ -174,32 +165,29 @@ def contenders(start: Config, found: Config) -> list[tuple[str, Config]]:
     return [(SHIPPED, shipped), *between, (FOUND, found)]
 
 
-def judge_unseen(
-    frames: WorkingSet, compared: Sequence[tuple[str, Config]], go_on: GoOn
-) -> list[Judged] | None:
+def judge_unseen(frames: WorkingSet, compared: Sequence[tuple[str, Config]], go_on: GoOn) -> Verdict | None:
     """Map the training frames with each of some parameters, with all pixels, and score the maps on the
     unseen frames; None if that was abandoned. Raises what mapping raises."""
-    lines = []
+    scores = {}
     for name, config in compared:
         trial = run_trial(config, frames, judged=frames.unseen, go_on=go_on)
         if trial is None:
             return None
-        lines.append(Judged(name, config, trial.scores))
-    return lines
+        scores[name] = trial.scores
+    return Verdict(len(frames.unseen), scores)
 
 
-def verdict_lines(judged: Sequence[Judged], views: int) -> list[str]:
+def verdict_lines(verdict: Verdict) -> list[str]:
     """The verdict as text, one line for each score: all contenders, and how the last differs from the
     first."""
     width = max(len(kind.label) for kind in KINDS)
-    columns = [max(len(each.name), 10) for each in judged]
-    head = "  ".join(f"{each.name:>{column}}" for each, column in zip(judged, columns, strict=True))
-    lines = [f"Scores on {views} views that were never looked at before:", f"  {'':{width}}  {head}  change"]
+    columns = [max(len(name), 10) for name in verdict.scores]
+    head = "  ".join(f"{name:>{column}}" for name, column in zip(verdict.scores, columns, strict=True))
+    title = f"Scores on {verdict.views} views that were never looked at before:"
+    lines = [title, f"  {'':{width}}  {head}  change"]
     for kind in KINDS:
-        values = [kind.value(each.scores) for each in judged]
-        if not any(map(math.isfinite, values)):
-            continue
-        texts = "  ".join(f"{kind.format(v):>{c}}" for v, c in zip(values, columns, strict=True))
-        change = f"{(values[-1] - values[0]) * kind.factor:+{kind.form.lstrip('+')}}"
-        lines.append(f"  {kind.label:{width}}  {texts}  {change}")
+        values = [kind.value(scores) for scores in verdict.scores.values()]
+        if any(map(math.isfinite, values)):
+            texts = "  ".join(f"{kind.format(v):>{c}}" for v, c in zip(values, columns, strict=True))
+            lines.append(f"  {kind.label:{width}}  {texts}  {kind.difference(values[-1], values[0])}")
     return lines

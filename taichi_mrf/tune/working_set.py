@@ -115,16 +115,7 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
             )
     frames = {role: tuple(frame for _, frame in found) for role, found in roles.items()}
     truth = truth_of(dataset, [index for index, _ in roles["training"]])
-    return WorkingSet(
-        dataset.name,
-        dataset.camera,
-        choice,
-        frames["training"],
-        frames["held_out"],
-        frames["unseen"],
-        tuple(skipped),
-        truth,
-    )
+    return WorkingSet(dataset.name, dataset.camera, choice, **frames, skipped=tuple(skipped), truth=truth)
 
 
 def split_indices(dataset: Dataset, choice: FrameChoice) -> tuple[list[int], list[int]]:

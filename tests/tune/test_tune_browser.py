@@ -1,5 +1,6 @@
 """The tuning page in a real Chromium: a slider moves scores and map; pin, restore, save."""
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,23 +66,27 @@ def pictures(page: LivePage) -> "Locator":
 
 def test_the_page_begins_with_the_scores_of_the_parameters_in_force(page: LivePage) -> None:
     assert shown_try(page) == 0
-    assert 40 < score(page, "right, 1.5 sigma") <= 100
+    assert 40 < score(page, "right, 1.5 voxels ↑") <= 100
     assert score(page, "keyframes") == 6
+    assert "RMS depth error" not in page.text()  # three scores first, the others folded
+    nearest_m = min(math.dist(page.position(), page.position(name)) for name in page.look().keyframes)
+    assert nearest_m < 2.0  # inside the room, behind the first keyframe
     assert page.input("Surface density (per m)").count() == 1
     assert page.page.get_by_text("Hit if free").count() == 0
     page.screenshot("tune_parameters")
 
 
 def test_a_slider_brings_a_new_score_and_another_map(page: LivePage) -> None:
-    before, likelihood = page.look(), score(page, "log-likelihood")
+    before, likelihood = page.look(), score(page, "fit, log-likelihood ↑")
     page.slide("Surface density (per m)", 5.0)
     rests(page, 1)
-    assert score(page, "log-likelihood") != likelihood
+    assert score(page, "fit, log-likelihood ↑") != likelihood
     page.until(
         lambda seen: seen.settled and (seen.voxels, seen.colors) != (before.voxels, before.colors),
         "another map",
     )
-    assert len(page.page.locator("svg circle").all()) >= 5
+    assert len(page.page.locator("svg circle").all()) >= 3
+    assert re.search(r"(better|worse) [▲▼] [+-]\d", page.text())
     page.screenshot("tune_after_a_slider")
 
 
@@ -95,12 +100,12 @@ def test_a_method_brings_its_own_sliders(page: LivePage) -> None:
 
 
 def test_restore_brings_sliders_scores_and_map_back(page: LivePage) -> None:
-    likelihood = {2: score(page, "log-likelihood")}
+    likelihood = {2: score(page, "fit, log-likelihood ↑")}
     page.tab("Tries")
     page.select("Selected try", re.compile(r"^1: "))
     page.press("Restore")
     rests(page, 1)
-    assert score(page, "log-likelihood") != likelihood[2]
+    assert score(page, "fit, log-likelihood ↑") != likelihood[2]
     page.tab("Parameters")
     box = page.input("Surface density (per m)").locator("xpath=..").get_by_role("textbox")
     page.until(lambda seen: box.input_value() == "5", "the slider where the try had it")
@@ -125,8 +130,10 @@ def test_a_pinned_try_is_what_others_are_compared_with(page: LivePage) -> None:
     page.until(lambda seen: "against try 1" in page.text(), "the other reference")
     page.screenshot("tune_tries")
     page.tab("Views")
-    page.until(lambda seen: "reference, try 1" in page.text(), "the reference's picture")
-    page.until(lambda seen: pictures(page).count() >= 4, "reference, this one, change, measured")
+    page.until(lambda seen: "A (left): try 1" in page.text(), "the reference's picture")
+    page.until(lambda seen: pictures(page).count() >= 2, "reference and this one; change and measured")
+    widths = pictures(page).evaluate_all("all => all.map(picture => picture.naturalWidth)")
+    assert widths.count(80 + 3 + 80) == 2  # A and B side by side
     page.select("Held-out view", "room-0007")
     page.pause(0.5)
     page.screenshot("tune_views")
@@ -155,3 +162,18 @@ def test_other_frames_begin_anew(page: LivePage) -> None:
         lambda seen: seen.settled and shown_try(page) == 0 and score(page, "keyframes") == 4, "their scores"
     )
     page.screenshot("tune_frames")
+
+
+def test_a_search_for_the_chosen_objective_shows_its_verdict_and_offers_best_yaml(
+    page: LivePage, tmp_path: Path
+) -> None:
+    pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
+    page.tab("Search")
+    page.select("Objective", "right")
+    page.slide("Tries", 5)
+    page.press("Start a search")
+    page.until(lambda seen: seen.settled and "that the search has not seen" in page.text(), "the verdict")
+    page.screenshot("tune_search")
+    page.download("Save best.yaml").save_as(tmp_path / "best.yaml")
+    assert config.load(tmp_path / "best.yaml").voxel_size == 0.1
+    assert "# Scores on 1 views that were never looked at before:" in (tmp_path / "best.yaml").read_text()

@@ -88,7 +88,11 @@ def test_the_board_tells_how_a_try_differs_from_the_reference() -> None:
     assert "Try 1" in board
     assert "+1.500" in board
     assert "+0.250" in board
-    assert "calibration, voxels" not in board  # there is no truth
+    assert "better ▲" in board
+    assert "calibration" not in board
+    rest = score_board_html(tries(), 1, 0, headline=False)
+    assert "calibration, depth ↓" in rest
+    assert "calibration, voxels" not in rest  # there is no truth
     assert "no scores yet" in score_board_html([], None, None)
 
 

@@ -21,7 +21,7 @@ SLIDERS = [knob for knob in KNOBS if knob.range is not None]
 @pytest.mark.parametrize("knob", KNOBS, ids=lambda knob: knob.name)
 def test_every_knob_is_a_parameter_with_help(knob: Knob) -> None:
     assert len(knob.parameter.help) > 20
-    value = knob.value_of(Config())
+    value = knob.parameter.value_of(Config())
     assert knob.parameter.replaced(Config(), value) == Config() or knob.parameter.coefficient is not None
 
 
@@ -39,7 +39,7 @@ def test_both_ends_of_a_slider_are_accepted_and_change_that_parameter_alone(knob
 
 @pytest.mark.parametrize("knob", SLIDERS, ids=lambda knob: knob.name)
 def test_the_shipped_default_lies_within_the_slider(knob: Knob) -> None:
-    value = knob.value_of(Config())
+    value = knob.parameter.value_of(Config())
     if value is not None:
         within = np.log10(value) if knob.decades else value
         assert knob.range.least <= within <= knob.range.most

@@ -12,8 +12,9 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.search import DEFAULT_SEARCH, SIGMA_SCALE, Search, dimensions
-from taichi_mrf.tune.trial import FOUND, SHIPPED, STARTED, Judged, contenders, judge_unseen, verdict_lines
+from taichi_mrf.tune.trial import FOUND, SHIPPED, STARTED, contenders, judge_unseen, verdict_lines
 from taichi_mrf.viewer.tune.knobs import KNOBS
+from taichi_mrf.viewer.tune.messages import Verdict
 
 pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
 
@@ -50,6 +51,15 @@ def test_a_search_can_be_repeated_by_its_seed() -> None:
 def test_it_comes_nearer_to_what_is_likeliest() -> None:
     best = max(asked(0, tries=40), key=lambda config: -abs(config.inference.surface_density - 5.0))
     assert abs(best.inference.surface_density - 5.0) < 0.5
+
+
+def test_the_smallest_depth_error_can_be_the_objective() -> None:
+    search = Search(CONFIG, (), 3, seed=0, objective="depth-error")
+    tried = []
+    for error_m in (0.02, 0.01, 0.03):
+        tried.append(search.ask())
+        search.tell(error_m)
+    assert search.best == tried[1]
 
 
 def test_a_failed_try_counts_but_is_never_the_best() -> None:
@@ -109,8 +119,10 @@ def test_the_verdict_is_that_of_the_unseen_views() -> None:
     other = judge_unseen(swapped, [(SHIPPED, CONFIG)], lambda activity, share: True)
     assert judged is not None
     assert other is not None
-    assert judged[0].scores.log_likelihood != other[0].scores.log_likelihood
+    assert judged.scores[SHIPPED].log_likelihood != other.scores[SHIPPED].log_likelihood
     assert judge_unseen(frames, [(SHIPPED, CONFIG)], lambda activity, share: False) is None
-    better = dataclasses.replace(judged[0].scores, log_likelihood=judged[0].scores.log_likelihood + 0.25)
-    lines = verdict_lines([*judged, Judged(FOUND, CONFIG, better)], 1)
-    assert any(line.strip().startswith("log-likelihood") and line.endswith("+0.250") for line in lines)
+    better = dataclasses.replace(
+        judged.scores[SHIPPED], log_likelihood=judged.scores[SHIPPED].log_likelihood + 0.25
+    )
+    lines = verdict_lines(Verdict(1, judged.scores | {FOUND: better}))
+    assert any(line.strip().startswith("fit, log-likelihood") and line.endswith("+0.250") for line in lines)

@@ -31,6 +31,7 @@ from taichi_mrf.viewer.tune.messages import (
     Tried,
     Try,
     Tuning,
+    Verdict,
 )
 
 
@@ -135,11 +136,11 @@ def test_pinning_compares_with_another_try() -> None:
     assert link.of_type(Pinned)[-1] == Pinned(1)
     last = link.of_type(HeldOutView)[-1]
     assert last.title == last.reference_title
-    assert last.change is None
+    assert last.change_title == ""
     before = next(view for view in link.of_type(HeldOutView) if view.title.startswith("try 1"))
     assert before.reference_title.startswith("try 0")
-    assert before.change is not None
-    assert before.accuracy.shape == before.reference.shape == (60, 80, 3)
+    assert "became right" in before.change_title
+    assert before.accuracy.shape == before.measured.shape == (60, 80 + 3 + 80, 3)
     assert link.errors() == ["there is no try 7"]
 
 
@@ -186,7 +187,8 @@ def test_a_search_is_made_and_judged_on_views_that_it_has_not_seen() -> None:
     best = max(link.of_type(Tried), key=lambda each: each.scores.log_likelihood)
     assert best.config == search.best
     assert link.of_type(Chosen)[-1].config == search.best
-    assert [line.name for line in session.verdict] == ["shipped defaults", "found"]
+    assert list(link.of_type(Verdict)[-1].scores) == ["shipped defaults", "found"]
+    assert link.of_type(Verdict)[-1].views == 1
     assert any("that were never looked at before" in notice.text for notice in link.of_type(Notice))
 
 
@@ -201,10 +203,11 @@ def test_the_verdict_is_told_when_the_search_ends_and_not_when_the_session_does(
         link,
         Policy(),
         search=search,
-        judged=lambda verdict: told.append([line.name for line in verdict]),
+        judged=told.append,
     )
     session.run(lambda: link.waits > 0)
-    assert told == [["shipped defaults", "found"]]
+    assert told == [session.verdict]
+    assert "found" in told[0][1]
     assert not session.ended
 
 

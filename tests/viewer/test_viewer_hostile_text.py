@@ -94,7 +94,8 @@ TUNE_UPDATES: tuple[m.Update, ...] = (
     t.Pinned(0),
     t.Chosen(1, CONFIG),
     t.Residuals(1, ONE, ONE, np.ones(1), np.ones(1), np.ones(1)),
-    t.HeldOutView(HOSTILE, PICTURE, PICTURE, HOSTILE, PICTURE, HOSTILE, PICTURE, HOSTILE),
+    t.Verdict(1, {HOSTILE: SCORES, "found": SCORES}),
+    t.HeldOutView(HOSTILE, PICTURE, HOSTILE, HOSTILE, PICTURE, HOSTILE),
     m.Notice(HOSTILE, "error"),
 )
 

@@ -32,7 +32,7 @@ class HandledTunePage(HandledPage):
         self.page.batch_done()
 
     def slider(self, name: str) -> Any:
-        return self.page.panel._knobs._handles[name]
+        return self.page.panel.knobs._handles[name]
 
     def move(self, name: str, value: float) -> KnobMoved:
         self.slider(name).value = value
@@ -84,6 +84,6 @@ def test_without_a_try_there_is_a_notice(handled: HandledTunePage) -> None:
 
 def test_held_out_views_and_frames_are_asked_for(handled: HandledTunePage) -> None:
     handled.page.panel.view.value = "d"
-    handled.page.panel._frames.handles["count"].value = 20
+    handled.page.panel.frames.handles["count"].value = 20
     handled.take(Used("Held-out view", 0), Used("Use these frames", 0), Used("Stop the search", 0))
     assert handled.asked == [t.LookAt(1), t.ChooseFrames(t.FrameChoice(count=20)), t.StopSearch()]

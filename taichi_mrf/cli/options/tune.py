@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -47,8 +47,11 @@ class Tune:
     search, too, and used for the final scores."""
 
     auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Search in N trials for parameters that make held-out measurements more likely (needs the extra auto:
-    Optuna)."""
+    """Search in N trials for parameters that score best on held-out frames (needs the extra auto: Optuna)."""
+
+    objective: Literal["right", "depth-error", "fit"] = "fit"
+    """Aim of the search: most pixels right within 1.5 voxels, smallest median depth error, or best fit, the
+    log-likelihood of held-out measurements."""
 
     search: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ""
     """Parameters to search, separated by commas; sensor.sigma_scale multiplies all coefficients of

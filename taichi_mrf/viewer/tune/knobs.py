@@ -123,10 +123,6 @@ class Knob:
         """True if the parameter changes anything under this configuration."""
         return self.method in (None, config.method) and self.counts(config)
 
-    def value_of(self, config: Config) -> Any:
-        """The parameter's value."""
-        return self.parameter.value_of(config)
-
 
 def _knobs_of(method: Method) -> list[Knob]:
     """A method's sliders, which name fields of its section."""

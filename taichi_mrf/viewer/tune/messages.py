@@ -2,7 +2,6 @@
 scores of a try: their labels, which direction is better, their format.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -16,6 +15,8 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.viewer.messages import Request, Update
 
 Better = Literal["higher", "lower", "neither"]
+Objective = Literal["right", "depth-error", "fit"]
+"""Aim of a search, by a word for the score."""
 
 
 @dataclass(frozen=True)
@@ -91,22 +92,34 @@ class ScoreKind:
             return "–"
         return f"{value * self.factor:{self.form}}" + (f" {self.unit}" if self.unit else "")
 
+    def difference(self, value: float, before: float) -> str:
+        """How much two values of this kind differ, with a sign, as text."""
+        return f"{(value - before) * self.factor:+{self.form.lstrip('+')}}"
+
 
 KINDS = (
     ScoreKind("accuracy_voxel", "right, in the voxel", "higher", 100, ".1f", "%"),
-    ScoreKind("accuracy_sigma", "right, 1.5 sigma", "higher", 100, ".1f", "%"),
+    ScoreKind("accuracy_sigma", "right, 1.5 voxels", "higher", 100, ".1f", "%"),
     ScoreKind("accuracy_5cm", "right, 5 cm", "higher", 100, ".1f", "%"),
     ScoreKind("unanswered", "no surface", "lower", 100, ".1f", "%"),
     ScoreKind("median_abs_m", "median depth error", "lower", 1000, ".1f", "mm"),
     ScoreKind("rms_m", "RMS depth error", "lower", 1000, ".0f", "mm"),
-    ScoreKind("log_likelihood", "log-likelihood", "higher", 1, "+.3f"),
+    ScoreKind("log_likelihood", "fit, log-likelihood", "higher", 1, "+.3f"),
     ScoreKind("depth_calibration", "calibration, depth", "lower", 100, ".1f", "%"),
     ScoreKind("voxel_calibration", "calibration, voxels", "lower", 100, ".2f", "%"),
-    ScoreKind("seconds", "seconds", "lower", 1, ".2f", "s"),
+    ScoreKind("seconds", "time to map", "lower", 1, ".2f", "s"),
     ScoreKind("voxels", "voxels", "neither", 1, ",.0f"),
     ScoreKind("keyframes", "keyframes", "neither", 1, ".0f"),
 )
 """In the order of the page."""
+
+_BY_NAME = {kind.name: kind for kind in KINDS}
+HEADLINE: dict[Objective, ScoreKind] = {
+    "right": _BY_NAME["accuracy_sigma"],
+    "depth-error": _BY_NAME["median_abs_m"],
+    "fit": _BY_NAME["log_likelihood"],
+}
+"""The scores that the page shows first, of which each can be the aim of a search."""
 
 
 def scores_in_words(scores: Scores) -> list[str]:
@@ -115,11 +128,6 @@ def scores_in_words(scores: Scores) -> list[str]:
     if scores.pixel_stride > 1:
         lines.append(f"of one pixel in {scores.pixel_stride**2} only")
     return lines
-
-
-def figures(scores: Scores) -> dict[str, float]:
-    """All scores by name."""
-    return dataclasses.asdict(scores)
 
 
 By = Literal["start", "hand", "search"]
@@ -215,17 +223,25 @@ class Residuals(Update):
 
 @dataclass(frozen=True)
 class HeldOutView(Update):
-    """Accuracy of the map in one held-out view, and of the reference, if there is one, and what changed
-    between the two. Pictures are (h, w, 3) uint8."""
+    """Where the map is right in one held-out view. Pictures are (h, w, 3) uint8: ``accuracy`` is the
+    reference, if there is one, beside the map; ``measured`` what changed between the two, if anything can
+    have, beside the measured depth."""
 
     name: str
-    measured: NDArray[np.uint8]
     accuracy: NDArray[np.uint8]
     title: str
-    reference: NDArray[np.uint8] | None
     reference_title: str
-    change: NDArray[np.uint8] | None
+    measured: NDArray[np.uint8]
     change_title: str
+
+
+@dataclass(frozen=True)
+class Verdict(Update):
+    """What a search has gained: the scores, on ``views`` that were kept from it, of some parameters by name;
+    the last are those that it has found."""
+
+    views: int
+    scores: dict[str, Scores]
 
 
 @dataclass(frozen=True)
@@ -258,11 +274,24 @@ class ChooseFrames(Request):
 
 @dataclass(frozen=True)
 class SaveTries(Request):
-    """Send a file to a client: the parameters of a try (yaml), or the table of all tries (csv)."""
+    """Send a file to a client: the parameters of a try (yaml) or those that the search has found (best), or
+    the table of all tries (csv)."""
 
-    kind: Literal["yaml", "csv"]
+    kind: Literal["yaml", "csv", "best"]
     number: int
     client: int
+
+
+@dataclass(frozen=True)
+class StartSearch(Request):
+    """Search from the parameters in force, with an empty table of tries."""
+
+    objective: Objective = "fit"
+    """Aim: most pixels right within 1.5 voxels, smallest median depth error, or best fit. The fit counts
+    how far the map's probabilities can be trusted, too."""
+
+    tries: Annotated[int, Range(5, 200, 1)] = 30
+    """Number of maps that the search makes."""
 
 
 @dataclass(frozen=True)

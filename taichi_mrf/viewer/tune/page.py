@@ -5,15 +5,19 @@ only its own parameter.
 """
 
 from collections.abc import Callable
+from functools import partial
+from typing import get_args
 
 import viser
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.up import up_of
+from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
+from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.panel import KnobMoved, TunePanel
 
@@ -28,7 +32,7 @@ class TunePage(BasePage[TunePanel]):
         inbox, self._config = Inbox(), Config()
         super().__init__(server, ask, inbox, TunePanel(server.gui, self._config, inbox.put))
         self._hello: m.Hello | None = None
-        self._has_up = False
+        self._has_view = False
         self._tuning: t.Tuning | None = None
         self._tries: dict[int, t.Tried] = {}
         self._shown: int | None = None
@@ -46,9 +50,13 @@ class TunePage(BasePage[TunePanel]):
             t.Chosen: self._show_chosen,
             t.Residuals: self.panel.noise.show,
             t.HeldOutView: self.panel.show_view,
+            t.Verdict: self.panel.show_verdict,
             KnobMoved: lambda moved: self._knob_moved(moved.name),
         }
         self.actions |= {
+            **{side.capitalize(): partial(self._look_from, side) for side in get_args(Side)},
+            "Start a search": lambda client: ask(self.panel.search.value()),
+            "Save best.yaml": lambda client: ask(t.SaveTries("best", 0, client)),
             "Stop the search": lambda client: ask(t.StopSearch()),
             "Use these frames": lambda client: self._choose_frames(),
             "Held-out view": lambda client: self._look_at(self.panel.view.value),
@@ -71,6 +79,7 @@ class TunePage(BasePage[TunePanel]):
         """Start with an empty table."""
         self._tuning, self._config = tuning, tuning.config
         self._tries.clear()
+        self._has_view = False
         self._shown = self._pinned = None
         self._moved, self._table_old, self._asked = False, True, None
         self.panel.show_tuning(tuning)
@@ -89,13 +98,22 @@ class TunePage(BasePage[TunePanel]):
             self.map.take(bricks)
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
-        if not self.keyframes.keyframes:
-            up = up_of(keyframe.T_world_camera, keyframe.camera.up)
-            if up != self.viewpoint.up or not self._has_up:  # another map keeps the user's view
-                self.viewpoint.set_up(up)
-                self._has_up = True
+        if not self._has_view:  # another map keeps the user's view
+            self._look_inside(keyframe)
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
+
+    def _look_inside(self, keyframe: m.KeyframeInfo) -> None:
+        """Begin where the first keyframe was, and a little behind: from outside, walls hide a room."""
+        self._has_view = True
+        self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
+        self.viewpoint.camera_moved(keyframe.T_world_camera, forwards(keyframe.camera))
+        self.viewpoint.set_following(True)
+
+    def _look_from(self, side: Side, client: int) -> None:
+        box = None if self.map is None else self.map.box_m()
+        if box is not None:
+            self.viewpoint.look_from(client, side, *box)
 
     def _take_activity(self, activity: t.Activity) -> None:
         self.panel.show_tuning_activity(activity)
@@ -124,7 +142,7 @@ class TunePage(BasePage[TunePanel]):
 
     def _knob_moved(self, name: str) -> None:
         try:
-            changed = self.panel.applied(name, self._config)
+            changed = self.panel.knobs.applied(name, self._config)
         except ConfigError as error:
             self.notify(m.Notice(str(error), "error"))
             self.panel.show_config(self._config)
@@ -147,7 +165,7 @@ class TunePage(BasePage[TunePanel]):
 
     def _choose_frames(self) -> None:
         try:
-            self.ask(t.ChooseFrames(self.panel.frame_choice()))
+            self.ask(t.ChooseFrames(self.panel.frames.value()))
         except ConfigError as error:
             self.notify(m.Notice(str(error), "error"))
 

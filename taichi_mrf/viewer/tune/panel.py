@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import viser
@@ -18,10 +18,11 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import OF_BELIEFS
+from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, change, in_html, in_markdown
+from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
-from taichi_mrf.viewer.tune.messages import KINDS, Activity, FrameChoice, HeldOutView, Tried, Tuning
-from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html
+from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html, verdict_html
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,6 @@ class KnobMoved(Event):
     name: str
 
 
-SAVE_BUTTONS = {
-    "Save YAML": "The parameters of the selected try, with its scores as a comment: for `map --config` and "
-    "`live --config`.",
-    "Save CSV": "The table of all tries with their parameters and scores.",
-}
 NONE_YET = "none yet"
 MAP_OPTIONS = (
     "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
@@ -44,19 +40,11 @@ MAP_OPTIONS = (
 
 _OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
 _FOLDERS = {"map": "Map", **_OWN, "keyframes": "Keyframes"}
-_FOLDED = ("keyframes",)
-_MOST_TRIES = 200
-"""Of the latest tries, how many the dropdown offers."""
-
 LEAST_DECADE = 1e-300
 """Shown in place of 0 by a slider of powers of ten."""
 
-MOST_ROWS = 150
-"""Of the table of tries."""
-
-_TABLE_COLUMNS = ("accuracy_sigma", "median_abs_m", "log_likelihood", "depth_calibration", "seconds")
-_TABLE_HEADS = ("1.5 σ", "median", "log-lik.", "calib.", "time")
-_TABLE_MARKS = {"search": "◆", "hand": "", "start": ""}
+MOST_TRIES = 150
+"""Of the latest tries, how many the table and the dropdown have."""
 
 
 class TunePanel(BasePanel):
@@ -66,65 +54,62 @@ class TunePanel(BasePanel):
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
         self._last_shown: int | None = None
-        self._knobs = KnobWidgets(gui, config, lambda name: tell(KnobMoved(name)))
+        self.knobs = KnobWidgets(gui, config, lambda name: tell(KnobMoved(name)))
         self._folders: dict[str, Any] = {}
         self._stop = self.add_button("Stop the search", visible=False)
         self.add_counts()
         self._scores = gui.add_html("")
+        with gui.add_folder("More scores", expand_by_default=False):
+            self._more_scores = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
             for section, title in _FOLDERS.items():
-                folder = gui.add_folder(title, expand_by_default=section not in _FOLDED)
+                folder = gui.add_folder(title, expand_by_default=section != "keyframes")
                 self._folders[section] = folder
                 with folder:
-                    self._knobs.add(section)
-        with tabs.add_tab("Noise", viser.Icon.CHART_DOTS):
-            self.noise = NoisePlot(gui)
-            self._knobs.add("sensor")
+                    self.knobs.add(section)
+        with tabs.add_tab("Search", viser.Icon.SEARCH):
+            self._search_tab()
         with tabs.add_tab("Views", viser.Icon.PHOTO):
             self._views_tab()
         with tabs.add_tab("Tries", viser.Icon.HISTORY):
             self._tries_tab()
+        with tabs.add_tab("Noise", viser.Icon.CHART_DOTS):
+            self.noise = NoisePlot(gui)
+            self.knobs.add("sensor")
         with tabs.add_tab("Map", viser.Icon.CUBE):
+            self.add_buttons("Look from", [side.capitalize() for side in get_args(Side)])
             self.add_legend()
             self.view_options.add(*MAP_OPTIONS)
             self.view_options.offer("color_by", OF_BELIEFS)
             self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
-            self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
-            self._frames.add()
+            self.frames = OptionWidgets(gui, t.FrameChoice(), lambda: None)
+            self.frames.add()
             hint = "Start again with these frames. The table of tries is emptied."
             self.add_button("Use these frames", hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._about = gui.add_html("")
             self.add_notices()
 
-    def frame_choice(self) -> FrameChoice:
-        """The working set as the widgets have it. Raises ConfigError."""
-        return self._frames.value()
-
-    def applied(self, name: str, config: Config) -> Config:
-        """The configuration with one parameter as its widget stands. Raises ConfigError."""
-        return self._knobs.applied(name, config)
-
     def show_config(self, config: Config) -> None:
         """Set all sliders and boxes, and the curves of the noise plot."""
-        self._knobs.show(config)
+        self.knobs.show(config)
         self.follow(config)
 
     def follow(self, config: Config) -> None:
         """Show what belongs to a configuration: its method's sliders, its noise curves."""
-        self._knobs.follow(config)
+        self.knobs.follow(config)
         for section in _OWN:
             folder, visible = self._folders[section], METHODS[config.method].section == section
             change(folder, visible=visible)
         self.noise.follow(config.sensor)
 
-    def show_tuning(self, tuning: Tuning) -> None:
+    def show_tuning(self, tuning: t.Tuning) -> None:
         """Show what is tuned, on which frames."""
         choice = tuning.choice
-        for name, handle in self._frames.handles.items():
+        for name, handle in self.frames.handles.items():
             if name == "first":
                 handle.max = max(1, tuning.frames - 1)
             handle.value = getattr(choice, name)
@@ -138,17 +123,27 @@ class TunePanel(BasePanel):
         rows = {"source": tuning.source, "backend": f"{tuning.backend} ({tuning.device})"}
         rows |= {"training": ", ".join(tuning.training), "held out": ", ".join(tuning.held_out)}
         self._about.content = rows_html(rows)
+        self._verdict.content = ""
+        change(self._save_best, visible=False)
         self.clear_notices()
 
-    def show_tuning_activity(self, activity: Activity) -> None:
+    def show_tuning_activity(self, activity: t.Activity) -> None:
         """Show what is being done, and a button that ends a search."""
         self.show_activity(activity.text, activity.share, activity.busy)
-        searching = activity.text.startswith("search")
+        searching = activity.text.startswith("search,")
         change(self._stop, visible=searching)
+        change(self._start, disabled=searching)
 
-    def show_tries(self, tries: Sequence[Tried], shown: int | None, pinned: int | None) -> None:
+    def show_verdict(self, verdict: t.Verdict) -> None:
+        """Show what the search has gained, and offer its parameters."""
+        title = f"<b>Verdict</b> on views that the search has not seen ({verdict.views}):"
+        self._verdict.content = f'<p style="margin:0.5em 0.75em">{title}</p>{verdict_html(verdict)}'
+        change(self._save_best, visible=True)
+
+    def show_tries(self, tries: Sequence[t.Tried], shown: int | None, pinned: int | None) -> None:
         """The scores, and the table. The dropdown goes to a try that is newly shown, else it stays."""
         self._scores.content = score_board_html(tries, shown, pinned)
+        self._more_scores.content = score_board_html(tries, shown, pinned, headline=False)
         self._table.content = table_html(tries, shown, pinned)
         if not tries:
             self._names = {}
@@ -157,8 +152,10 @@ class TunePanel(BasePanel):
         first, chosen = tries[0].config, self.chosen_try()
         if shown != self._last_shown or chosen is None:
             chosen = self._last_shown = shown
-        latest = list(tries)[-_MOST_TRIES:]
-        self._names = {f"{t.number}: {changes(first, t.config)}"[:80]: t.number for t in latest[::-1]}
+        latest = list(tries)[-MOST_TRIES:]
+        self._names = {
+            f"{each.number}: {changes(first, each.config)}"[:80]: each.number for each in latest[::-1]
+        }
         change(self.attempt, options=tuple(self._names))
         name = next((name for name, number in self._names.items() if number == chosen), None)
         if name is not None:
@@ -168,35 +165,37 @@ class TunePanel(BasePanel):
         """The try that the dropdown stands at."""
         return self._names.get(self.attempt.value)
 
-    def show_view(self, view: HeldOutView) -> None:
-        """The accuracy image of a held-out view beside that of the reference."""
-        self._measured.image, self._accuracy.image = view.measured, view.accuracy
-        if view.reference is not None:
-            self._reference.image = view.reference
-        if view.change is not None:
-            self._change.image = view.change
-        self._measured.visible = self._accuracy.visible = True
-        self._change.visible = view.change is not None
-        self._change_text.content = in_markdown(view.change_title)
-        self._reference.visible = view.reference is not None
-        self._accuracy_text.content = f"**B** · {in_markdown(view.title)}"
-        self._reference_text.content = (
-            f"**A** · reference, {in_markdown(view.reference_title)}" if view.reference is not None else ""
+    def show_view(self, view: t.HeldOutView) -> None:
+        """Where the map is right in a held-out view, beside the reference; what changed beside the depths."""
+        self._accuracy.image, self._measured.image = view.accuracy, view.measured
+        self._accuracy.visible = self._measured.visible = True
+        beside = f"**A** (left): {in_markdown(view.reference_title)}. " if view.reference_title else ""
+        self._accuracy_text.content = f"{beside}**B**: {in_markdown(view.title)}."
+        changed = f"{in_markdown(view.change_title)} (left); " if view.change_title else ""
+        self._measured_text.content = f"{changed}measured depth."
+
+    def _search_tab(self) -> None:
+        self.gui.add_markdown(
+            "Lets the computer move the sliders: prior, outliers and noise, beginning with the present ones. "
+            "Half of the held-out views are kept from the search and judge it at the end."
         )
+        self.search = OptionWidgets(self.gui, t.StartSearch(), lambda: None)
+        self.search.add()
+        self._start = self.add_button("Start a search", "The table of tries is emptied.")
+        self._verdict = self.gui.add_html("")
+        hint = "What the search has found, with the verdict as a comment: for `map --config`."
+        self._save_best = self.add_button("Save best.yaml", hint, visible=False)
 
     def _views_tab(self) -> None:
         gui = self.gui
         hint = "A frame that is not in the map and scores it."
         self.view = self.watch(gui.add_dropdown("Held-out view", [NONE_YET], hint=hint))
-        gui.add_markdown("Right (blue), wrong (orange), no surface (light), not judged (dark).")
         black = np.zeros((2, 2, 3), np.uint8)
-        self._reference_text = gui.add_markdown("")
-        self._reference = gui.add_image(black, visible=False)
         self._accuracy_text = gui.add_markdown("")
         self._accuracy = gui.add_image(black, visible=False)
-        self._change_text = gui.add_markdown("")
-        self._change = gui.add_image(black, visible=False)
-        self._measured = gui.add_image(black, label="measured depth", visible=False)
+        gui.add_markdown("Right (blue), wrong (orange), no surface (light), not judged (dark).")
+        self._measured_text = gui.add_markdown("")
+        self._measured = gui.add_image(black, visible=False)
 
     def _tries_tab(self) -> None:
         gui = self.gui
@@ -205,8 +204,8 @@ class TunePanel(BasePanel):
             "Selected try", [NONE_YET], hint="The try that the buttons use, with what it changed."
         )
         self.add_buttons("Try", ("Restore", "Pin"))
-        for name, hint in SAVE_BUTTONS.items():
-            self.add_button(name, hint)
+        self.add_button("Save YAML", "The parameters of the selected try and its scores, for `map --config`.")
+        self.add_button("Save CSV", "The table of all tries with their parameters and scores.")
         gui.add_markdown(
             "**Restore** sets the sliders to the selected try and maps with it again. **Pin** makes it the "
             "reference (A): scores and pictures of other tries are compared with it."
@@ -255,7 +254,7 @@ class KnobWidgets:
 
 def shown_value(knob: Knob, config: Config) -> Any:
     """Value that a knob's widget shows: the parameter's or its power of ten, clamped to the range."""
-    value = knob.value_of(config)
+    value = knob.parameter.value_of(config)
     if knob.range is None:
         return value
     if value is None:
@@ -271,36 +270,35 @@ def config_value(knob: Knob, shown: Any) -> Any:
     return float(f"{10.0**shown:.4g}") if knob.decades else shown
 
 
-def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) -> str:
+def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) -> str:
     """A row of scores for each try, and below it what it changed from the first."""
     if not tries:
         return ""
-    kinds = {kind.name: kind for kind in KINDS}
     best = max(
         (each for each in tries if each.scores.pixel_stride == 1),
         key=lambda each: each.scores.log_likelihood,
         default=None,
     )
-    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in _TABLE_HEADS)
+    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in t.HEADLINE)
     rows = [f'<tr style="opacity:0.65"><th></th>{head}</tr>']
-    for each in list(tries)[: -MOST_ROWS - 1 : -1]:
+    for each in list(tries)[: -MOST_TRIES - 1 : -1]:
         marks = "▸" if each.number == shown else ""
         marks += " A" if each.number == pinned else ""
         marks += "★" if each is best else ""
         about = "~" if each.scores.pixel_stride > 1 else ""
         numbers = "".join(
-            f'<td style="text-align:right;white-space:nowrap">{about}{kinds[name].text(each.scores)}</td>'
-            for name in _TABLE_COLUMNS
+            f'<td style="text-align:right;white-space:nowrap">{about}{kind.text(each.scores)}</td>'
+            for kind in t.HEADLINE.values()
         )
         shade = "background:rgba(0,114,178,0.12);" if each.number == shown else ""
         rows.append(
             f'<tr style="{shade}"><td style="white-space:nowrap"><b>{each.number}</b> {marks}'
-            f"{_TABLE_MARKS[each.by]}</td>{numbers}</tr>"
+            f"{'◆' * (each.by == 'search')}</td>{numbers}</tr>"
             f'<tr style="{shade}"><td></td>'
-            f'<td colspan="{len(_TABLE_COLUMNS)}" style="opacity:0.7;padding-bottom:3px">'
+            f'<td colspan="{len(t.HEADLINE)}" style="opacity:0.7;padding-bottom:3px">'
             f"{in_html(changes(tries[0].config, each.config))}</td></tr>"
         )
-    key = "▸ shown · A reference · ★ highest likelihood · ◆ from the search · ~ some of the pixels"
+    key = "▸ shown · A reference · ★ best fit · ◆ from the search · ~ some of the pixels"
     return (
         '<div style="max-height:22em;overflow:auto;margin:0 0.5em">'
         f'<table style="font-size:0.75em;border-spacing:0.4em 0;width:100%">{"".join(rows)}</table></div>'

@@ -1,5 +1,6 @@
 """Plots of the tuning page: the scores of the shown try as numbers, differences from the reference and
-sparklines, and the residuals of the held-out views against depth, with the curves of bias and sigma.
+sparklines, the verdict on a search, and the residuals of the held-out views against depth, with the curves
+of bias and sigma.
 """
 
 import math
@@ -13,40 +14,58 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.config.text import field_help
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
 from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
-from taichi_mrf.viewer.tune.messages import KINDS, Residuals, ScoreKind, Tried
+from taichi_mrf.viewer.tune.messages import HEADLINE, KINDS, Residuals, ScoreKind, Scores, Tried, Verdict
 
 MOST_POINTS = 60
 """Of the latest tries, how many a sparkline shows."""
 
 _WIDTH, _HEIGHT, _MARGIN = 84, 18, 2
-_GOOD, _BAD, _LINE, _REFERENCE = "#0072b2", "#d55e00", "#5c677d", "#a0a8b5"
+_GOOD, _BAD = "light-dark(#0072b2, #56b4e9)", "light-dark(#b84a00, #f08a3c)"
+_LINE, _DOT, _REFERENCE = "#7c879d", "#d55e00", "#a0a8b5"
+_BETTER = {"higher": " ↑", "lower": " ↓", "neither": ""}
 _SAME = 0.005
 """Differences below this share of the range over all tries get no colour."""
 
 
-def score_board_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) -> str:
-    """A table with a row for each figure that any try has. ``shown`` and ``pinned`` are numbers of tries."""
+def score_board_html(
+    tries: Sequence[Tried], shown: int | None, pinned: int | None, headline: bool = True
+) -> str:
+    """A table with a row for each of the first scores, or for each other score that any try has. ``shown``
+    and ``pinned`` are numbers of tries."""
     by_number = {each.number: each for each in tries}
     here, reference = by_number.get(-1 if shown is None else shown), by_number.get(pinned or 0)
     if here is None:
         return _table('<tr><td style="opacity:0.6">no scores yet</td></tr>')
     rows = [
         _row(kind, tries, here, reference)
-        for kind in KINDS
+        for kind in (HEADLINE.values() if headline else KINDS)
+        if headline or kind not in HEADLINE.values()
         if any(math.isfinite(kind.value(each.scores)) for each in tries)
     ]
     coarse = (
         f", first look (1 pixel in {here.scores.pixel_stride**2})" if here.scores.pixel_stride > 1 else ""
     )
-    against = "" if reference is None or reference is here else f", against try {reference.number}"
+    against = "" if reference is None or reference is here else f", against try {reference.number} (A)"
     head = (
         f'<tr><td colspan="4"><b>Try {here.number}</b>'
         f'<span style="opacity:0.65">{in_html(coarse + against)}</span></td></tr>'
     )
-    return _table(head + "".join(rows))
+    return _table(head * headline + "".join(rows))
+
+
+def verdict_html(verdict: Verdict) -> str:
+    """A table of the first scores of all contenders, with what the last gains over the first."""
+    first, *_, last = verdict.scores.values()
+    names = "".join(f'<th style="font-weight:500">{in_html(name)}</th>' for name in verdict.scores)
+    rows = [f'<tr style="opacity:0.65;text-align:right"><th></th>{names}<th></th></tr>']
+    for kind in HEADLINE.values():
+        values = "".join(_cell(kind.text(scores)) for scores in verdict.scores.values())
+        rows.append(f"<tr>{_label(kind)}{values}{_change(kind, last, first)}</tr>")
+    return _table("".join(rows))
 
 
 def sparkline_svg(values: Sequence[float], shown: int, reference: float) -> str:
@@ -76,37 +95,52 @@ def sparkline_svg(values: Sequence[float], shown: int, reference: float) -> str:
         )
     if 0 <= shown < len(values) and math.isfinite(values[shown]):
         x = _MARGIN + shown * step
-        drawn += f'<circle cx="{x:.1f}" cy="{height(values[shown]):.1f}" r="2.2" fill="{_BAD}"/>'
+        drawn += f'<circle cx="{x:.1f}" cy="{height(values[shown]):.1f}" r="2.2" fill="{_DOT}"/>'
     return f'<svg width="{_WIDTH}" height="{_HEIGHT}" style="vertical-align:middle">{drawn}</svg>'
 
 
 def _row(kind: ScoreKind, tries: Sequence[Tried], here: Tried, reference: Tried | None) -> str:
     latest = list(tries)[-MOST_POINTS:]
     values = [kind.value(each.scores) for each in latest]
-    value = kind.value(here.scores)
     against = float("nan") if reference is None else kind.value(reference.scores)
-    change, color = "", "inherit"
-    if reference is not here and math.isfinite(against) and math.isfinite(value):
-        difference = value - against
-        known = [each for each in values if math.isfinite(each)]
-        change = f"{difference * kind.factor:+{kind.form.lstrip('+')}}"
-        worth_it = abs(difference) > _SAME * (max(known) - min(known))
-        if worth_it and float(change.replace(",", "")) != 0 and kind.better != "neither":
-            color = _GOOD if (difference > 0) == (kind.better == "higher") else _BAD
     shown = next((i for i, each in enumerate(latest) if each is here), -1)
-    line = sparkline_svg(values, shown, against)
-    cells = (
-        f'<td style="white-space:nowrap">{in_html(kind.label)}</td>'
-        f'<td style="text-align:right;white-space:nowrap"><b>{kind.text(here.scores)}</b></td>'
-        f'<td style="text-align:right;white-space:nowrap;color:{color}">{change}</td>'
-        f"<td>{line}</td>"
+    known = [value for value in values if math.isfinite(value)]
+    other = None if reference is None or reference is here else reference.scores
+    change = _change(kind, here.scores, other, max(known, default=0.0) - min(known, default=0.0))
+    text = f"<b>{kind.text(here.scores)}</b>"
+    return f"<tr>{_label(kind)}{_cell(text)}{change}<td>{sparkline_svg(values, shown, against)}</td></tr>"
+
+
+def _label(kind: ScoreKind) -> str:
+    """The name of a score, an arrow to where it is better, and its meaning as a tooltip."""
+    meaning = in_html(field_help(Scores)[kind.name])
+    return (
+        f'<td style="white-space:nowrap" title="{meaning}">{in_html(kind.label)}{_BETTER[kind.better]}</td>'
     )
-    return f"<tr>{cells}</tr>"
+
+
+def _change(kind: ScoreKind, scores: Scores, before: Scores | None, spread: float = 0.0) -> str:
+    """How a score differs, with an arrow and in the colour of better or worse; a difference that is small in
+    the ``spread`` over all tries has neither."""
+    difference = float("nan") if before is None else kind.value(scores) - kind.value(before)
+    if before is None or not math.isfinite(difference):
+        return "<td></td>"
+    text = kind.difference(kind.value(scores), kind.value(before))
+    if not float(text.replace(",", "")):
+        return _cell("same")
+    if abs(difference) <= _SAME * spread or kind.better == "neither":
+        return _cell(text)
+    word, color = ("better", _GOOD) if (difference > 0) == (kind.better == "higher") else ("worse", _BAD)
+    return _cell(f"{word} {'▲' if difference > 0 else '▼'} {text}", color)
+
+
+def _cell(text: str, color: str = "inherit") -> str:
+    return f'<td style="text-align:right;white-space:nowrap;color:{color}">{text}</td>'
 
 
 def _table(rows: str) -> str:
     return (
-        '<table style="margin:0 0.6em 0.8em;font-size:0.8em;border-spacing:0.45em 0;line-height:1.25">'
+        '<table style="margin:0 0.6em 0.4em;font-size:0.8em;border-spacing:0.45em 0;line-height:1.3">'
         f"{rows}</table>"
     )
 
