@@ -124,7 +124,7 @@ def the_tuning_page() -> Iterator[LivePage]:
         chromium() as browser,
         LivePage(browser, program.address(), WIDTH, 1160) as page,
     ):
-        page.until_settled()
+        page.until(lambda seen: seen.settled and seen.voxels, "the first map")
         page_pictures.make_tries(page)
         yield page
 

@@ -151,7 +151,7 @@ def tune_panels(page: LivePage) -> Image.Image:
     page.tab("Tries")
     tries = panel(page)
     page.tab("Views")
-    page.until(lambda seen: page.page.locator("img").count() >= 4, "reference, this one, change, measured")
+    page.until(lambda seen: page.page.locator("img").count() >= 2, "where the maps are right, the depths")
     return side_by_side(tries, panel(page))
 
 
