@@ -76,7 +76,7 @@ class Rules:
     """Least share of the largest eigenvalue that a direction needs to be moved in; others keep the guess."""
 
     observable_by_depth: float = 0.005
-    """The same share where the guess is precise and depth could carry the camera away from it."""
+    """Least share where the guess is precise and depth could carry the camera away from it."""
 
     carried_m: float = 0.08
     """Metres from a guess beyond which the directions that depth determines badly have to prove themselves:

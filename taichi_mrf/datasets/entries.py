@@ -108,7 +108,7 @@ def _is_scan_folder(path: Path) -> bool:
 
 
 def reader(place: str) -> Callable[..., Any]:
-    """What opens a source, "module:function" in this package, which is imported when it is called."""
+    """Opener of a source, "module:function" in this package, which is imported when it is called."""
     return when_called(f"{HERE}.{place}")
 
 

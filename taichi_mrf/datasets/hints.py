@@ -83,8 +83,8 @@ _LOOKED_AT = 20
 
 
 def hint_for(path: Path) -> str | None:
-    """What a file, or most of a folder, holds instead of depth images, and which command reads it; None if
-    it is unknown."""
+    """A sentence on what a file, or most of a folder, holds in place of depth images, and on the command that
+    reads it; None if it is unknown."""
     if holds_scans(path):
         return (
             "contains scans of a 2D laser scanner, not depth images; map them with: "

@@ -113,7 +113,7 @@ _READERS: tuple[tuple[bytes, Callable[[bytes], Size | None]], ...] = (
     (rb"RIFF....WEBP", _webp),
     (rb"II\*\0|MM\0\*", _tiff),
 )
-"""What files of each format begin with, and the reader of their headers."""
+"""First bytes of the files of each format, and the reader of their headers."""
 
 _JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
 """Markers of a JPEG's segments that begin with its size."""

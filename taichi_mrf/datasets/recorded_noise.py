@@ -70,8 +70,8 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
 
 
 def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
-    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels, and of
-    ``inference.outlier_floor``, which then is set."""
+    """The recording's settings for whoever tries other values of ``sensor.sigma``, which then is that of all
+    pixels, and of ``inference.outlier_floor``, which then is set."""
     settings = _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
     return _with_outliers(settings, settings.inference.floor)
 

@@ -26,7 +26,7 @@ from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, with
 
 @ti.dataclass
 class _Cursor(Struct):
-    """Where a beam's next cell is written."""
+    """Place at which a beam's next cell is written."""
 
     next: ti.i32
 

@@ -150,7 +150,7 @@ class _MergeRule(Bundle):
     """See :func:`stride_metres`."""
 
     free_stride_metres: F32
-    """The same of groups."""
+    """Stride of groups, as above."""
 
     agree_m: F32
     """Measurements in metres agree if they differ by no more than this,"""

@@ -428,7 +428,7 @@ def _number_of(name: str) -> int | None:
 
 
 def _packed_bound(size: int) -> int:
-    """What a packed file may have, if it unpacks to ``size`` bytes."""
+    """Largest size of a packed file that unpacks to ``size`` bytes."""
     return 2 * size + 4096
 
 

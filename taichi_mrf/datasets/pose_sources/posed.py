@@ -92,7 +92,7 @@ class FramePoses:
         return changed is not None
 
     def as_written(self, frame_names: Sequence[str]) -> "FramePoses":
-        """The same poses, without their conventions undone."""
+        """These poses, without their conventions undone."""
         written = FramePoses(self.source, frame_names, self._gap_s)
         written.take(self._taken)
         return written

@@ -324,7 +324,7 @@ class RoomOptions(RenderOptions):
     round."""
 
     moving: Literal["none", "things", "door", "walker"] = "none"
-    """What moves: nothing; things that appear, leave and are moved; a door; or a person who walks through. If
+    """Moving things: none; things that appear, leave and are moved; a door; or a person who walks through. If
     something moves, the seed chooses places and times too, a frame is taken every second, and the camera
     looks at what happens."""
 

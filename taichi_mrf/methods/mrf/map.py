@@ -321,7 +321,7 @@ class MRFMap(BrickMap):
         return count_observations(slots, sent, self._pool)
 
     def votes_at(self, point: ArrayLike) -> dict[int, float]:
-        """What each keyframe says of the voxel at a point (3,) in metres, by id: the log-odds that it adds
+        """The vote of each keyframe on the voxel at a point (3,) in metres, by id: the log-odds that it adds
         to those of the others, above 0 for occupied. Keyframes that say nothing are left out, and frozen
         ones."""
         inferring.restore_messages(self._parts)
