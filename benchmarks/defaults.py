@@ -1,4 +1,4 @@
-"""What maps answer by the defaults of before and of now, side by side: a table for docs/benchmarks.md.
+"""Answers of maps by the defaults of before and of now, side by side: a table for docs/benchmarks.md.
 
     python benchmarks/defaults.py --data ../shared/data
 

@@ -24,7 +24,7 @@ from taichi_mrf.viewer.tune.messages import FrameChoice
 
 @dataclass(frozen=True)
 class Options:
-    """What to try."""
+    """Arguments of the measurement."""
 
     source: Annotated[str, tyro.conf.Positional]
     """A recording or a built-in sequence."""

@@ -44,7 +44,7 @@ SWEEPS = 3
 
 @dataclass(frozen=True)
 class Options:
-    """What to run on."""
+    """Device to run on."""
 
     arch: str = "cuda"
     """The backend: cuda, or another to try the script out."""

@@ -1,4 +1,4 @@
-"""What thousands of scans of a spinning lidar cost: time and memory along a street without end.
+"""Cost of thousands of scans of a spinning lidar: time and memory along a street without end.
 
     python benchmarks/lidar_drive.py --scans 3000 --voxel-size 0.2 --window-m 40
 
@@ -34,7 +34,7 @@ BLOCK_M = 18.0
 
 @dataclass(frozen=True)
 class Options:
-    """What to map."""
+    """Recording to map."""
 
     scans: int = 3000
     """Scans, a metre apart."""

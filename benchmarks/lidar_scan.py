@@ -1,4 +1,4 @@
-"""What a new scan of a spinning lidar costs, with and without OctoMap beside it.
+"""Cost of a new scan of a spinning lidar, with and without OctoMap beside it.
 
     python benchmarks/lidar_scan.py --voxel-size 0.1
 
@@ -27,7 +27,7 @@ SIGMA_M, REACH_M, STEP_M = 0.02, 30.0, 0.25
 
 @dataclass(frozen=True)
 class Options:
-    """What to map."""
+    """Recording to map."""
 
     voxel_size: float = 0.1
     """Metres."""

@@ -1,4 +1,4 @@
-"""What a closed loop costs: most poses of a trajectory change, and the map follows.
+"""Cost of a closed loop: most poses of a trajectory change, and the map follows.
 
     python -m benchmarks.loop_closure --keyframes 500 --moved 300 --voxel-size 0.05
 
@@ -33,7 +33,7 @@ from taichi_mrf.system import runtime
 
 HELD_OUT = 20
 DRIFT_M, DRIFT_RADIANS = (0.22, 0.20, 0.04), math.radians(1.0)
-"""What the last pose is off by: 30 cm, and a degree about the vertical."""
+"""Error of the last pose: 30 cm, and a degree about the vertical."""
 
 POINT, SAME_ANSWERS = 0.01, 0.98
 USABLE_POINTS = 2
@@ -43,7 +43,7 @@ TRUNCATION = 4.0
 
 @dataclass(frozen=True)
 class Options:
-    """What to map, and how to look at it."""
+    """Recording to map, and the way to look at it."""
 
     keyframes: int = 500
     """Keyframes of the walk."""
@@ -138,7 +138,7 @@ class Judge:
         return (self.accuracy - right) / POINT if same >= SAME_ANSWERS else math.inf
 
     def equal(self, m: MRFMap) -> bool:
-        """Whether the maps have the same voxels with the same probabilities, bit for bit."""
+        """True if the maps have the same voxels with the same probabilities, bit for bit."""
         (centres, p), (others, q) = (_sorted(*each.voxels(0.0)) for each in (m, self.anew))
         return np.array_equal(centres, others) and np.array_equal(p, q)
 

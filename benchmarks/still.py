@@ -1,4 +1,4 @@
-"""What a live run calls moving: the share of dynamic voxels, and what is listed as having come or gone.
+"""Motion that a live run reports: the share of dynamic voxels, and the list of what came or went.
 
     python benchmarks/still.py FOLDER --limit 100
 
@@ -25,7 +25,7 @@ from taichi_mrf.viewer.messages import KeyframeInfo, Request, SceneChanges, Upda
 
 @dataclass(frozen=True)
 class Options:
-    """What to replay."""
+    """Recording to replay."""
 
     source: Annotated[str, tyro.conf.Positional]
     """A recording or a built-in sequence."""

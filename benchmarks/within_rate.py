@@ -23,7 +23,7 @@ _TRIES = 5
 
 @dataclass(frozen=True)
 class Options:
-    """What to ask."""
+    """Queries to time."""
 
     voxel_size: float = 0.05
     """Metres."""

@@ -1,4 +1,4 @@
-"""What all tests share: the Taichi backend they run on, and where the real recordings lie.
+"""Parts that all tests share: the Taichi backend they run on, and where the real recordings lie.
 
 Taichi can be started once in a process, so each backend is a run of its own: ``pytest --arch vulkan``
 runs only the tests of kernels that are marked for it (``backends``, ``compilers``, ``smoke``), on Vulkan (a
@@ -22,7 +22,7 @@ from taichi_mrf.errors import BackendError
 from taichi_mrf.system import runtime
 
 SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
-"""Where hypothesis keeps what @settings said; it has no public way to ask."""
+"""Attribute in which hypothesis keeps what @settings said; it has no public way to ask."""
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
@@ -155,7 +155,7 @@ def _its_tests(session: pytest.Session, file: pytest.Module) -> list[pytest.Item
 
 
 def _is_first(config: pytest.Config, path: Path) -> bool:
-    """Whether this process is the first to take a file or folder of tests."""
+    """True if this process is the first to take a file or folder of tests."""
     try:
         (config.getoption("--queue") / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
     except FileExistsError:
@@ -173,7 +173,7 @@ def _uses(item: pytest.Item, fixture: str) -> bool:
 
 
 def _is_large(item: pytest.Item) -> bool:
-    """Whether it reads a whole recording."""
+    """True if it reads a whole recording."""
     return item.get_closest_marker("shared_data") is not None
 
 

@@ -86,7 +86,7 @@ class SeenSpace:
         return points
 
     def judge_paths(self, places: NDArray[np.float64], radius_m: float) -> NDArray[np.int8]:
-        """Whether balls at places (P, N, 3) along paths hit or miss: OCCUPIED, FREE or NOT_JUDGED, (P,)."""
+        """Verdict on balls at places (P, N, 3) along paths: OCCUPIED, FREE or NOT_JUDGED, (P,)."""
         points = places.reshape(-1, 3)
         near, unseen = np.empty(len(points)), np.empty(len(points))
         low = np.asarray(self.truth.window.lowest) * BRICK

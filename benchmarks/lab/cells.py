@@ -120,7 +120,7 @@ def _result(experiment: Experiment, place: _Place, voxel_size: float) -> dict[st
 
 
 def _judge(contender: Contender, place: _Place, voxel_size: float, seed: int) -> dict[str, Any]:
-    """What a map says of cells, balls and paths, compared with the truth."""
+    """A map's answers on cells, balls and paths, compared with the truth."""
     scene = place.scene
     m: Any = contender.make(scene, voxel_size)
     for view in scene.views:

@@ -38,7 +38,7 @@ LEAST_VOXELS = 10
 """Views that alone would show fewer voxels of a thing decide nothing."""
 
 FRESH_S = 10.0
-"""What came to its place less than this long ago is new."""
+"""Seconds for which a thing that came to its place is new."""
 
 POINTS = 300
 """At most so many points of new things are looked at in each view."""
@@ -239,7 +239,7 @@ def run_script(
 
 
 def perfect_drives(truth: MovingTruth) -> Drives:
-    """What comes of the same paths if they are planned on the true scene at each keyframe's time."""
+    """Outcome of the same paths if they are planned on the true scene at each keyframe's time."""
     drives = Drives()
     for index in range(FIRST_DRIVE, len(truth.room)):
         paths, clearance_m = _paths(truth, index)

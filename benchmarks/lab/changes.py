@@ -56,7 +56,7 @@ TARGETS = {
 
 
 def run_changes(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """What changes in the maps, and what a robot that trusts them hits."""
+    """Changes in the maps, and things that a robot which trusts them hits."""
     frames = min(FRAMES, experiment.limit or FRAMES)
     seeds = [seed for seed in experiment.seeds if seed != TUNED_ON][:SEEDS]
     changes: list[list[Entry]] = []

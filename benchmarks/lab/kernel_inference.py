@@ -35,7 +35,7 @@ class KernelModel:
     """The samples of one scan in a cube of this size are replaced by their mean."""
 
     prior: float = 0.001
-    """What is counted of either state without any sample."""
+    """Count of either state without any sample."""
 
     def weights(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """The sparse kernel of distances up to ``length_m``: 1 at 0, falling to 0."""
@@ -47,7 +47,7 @@ class KernelModel:
         return [replace(self, length_m=a, spacing_m=b) for a in LENGTHS_M for b in SPACINGS_M]
 
     def in_words(self) -> str:
-        """What is tuned."""
+        """Tuned parameters."""
         return f"length {self.length_m * 100:g} cm, spacing {self.spacing_m * 100:g} cm"
 
 
@@ -87,7 +87,7 @@ class KernelMap:
 
 
 def samples_of(view: SceneView, model: KernelModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What one scan says to be occupied (N, 3) and free (M, 3), in metres in the world."""
+    """Points that one scan says to be occupied (N, 3) and free (M, 3), in metres in the world."""
     camera = view.camera
     assert camera is not None  # each scan has rays of its own
     T, seen = view.T_world_camera, view.judged

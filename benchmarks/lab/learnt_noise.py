@@ -43,14 +43,14 @@ def frames_of(scene: Scene, indices: Sequence[int]) -> SceneFrames:
 
 
 def noise_key(scene: Scene, voxel_size: float) -> str:
-    """What the ledger's entries about a scene's noise begin with."""
+    """Begin of the ledger's entries about a scene's noise."""
     return f"{scene.name} | {len(scene.views)} views | {voxel_size:g} m"
 
 
 def learnt_law(
     experiment: Experiment, given: Contender, scene: Scene, voxel_size: float, keyframes: Sequence[int]
 ) -> Result:
-    """What the mapped views of a scene say of its noise: ``scale`` and ``added_m`` of the law, the single
+    """Noise of a scene by its mapped views: ``scale`` and ``added_m`` of the law, the single
     ``factor``, and ``prior``, parameters of inference that come with it. Maps are those of ``given``."""
 
     def learn() -> Result:

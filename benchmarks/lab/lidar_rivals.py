@@ -27,7 +27,7 @@ def contender_of(config: WavemapConfig, name: str = "") -> Contender:
 
 
 def in_words(config: WavemapConfig) -> str:
-    """What was tuned."""
+    """Tuned parameters."""
     return (
         f"{config.beams}, {config.angle_sigma_deg:g}°, {config.range_sigma * 100:g} cm, "
         f"free {config.scaling_free:g}, occupied {config.scaling_occupied:g}"

@@ -51,7 +51,7 @@ class Standing:
 
 
 class MovingTruth:
-    """What is known of a moving room (``synthetic:room?moving=...``) and of its frames, one a second."""
+    """Truth of a moving room (``synthetic:room?moving=...``) and of its frames, one a second."""
 
     def __init__(self, room: SyntheticRoom) -> None:
         """Raises ConfigError if nothing moves in the room, or its script repeats itself in the frames."""
@@ -68,7 +68,7 @@ class MovingTruth:
 
     @property
     def standings(self) -> list[Standing]:
-        """Where things stand, one after the other."""
+        """Places of things, one after the other."""
         return [
             Standing(thing, placed(thing.solids, stay.begin), stay.start_s, stay.end_s)
             for thing in self.scene.things
@@ -77,7 +77,7 @@ class MovingTruth:
         ]
 
     def _sees(self, standing: Standing, index: int) -> bool:
-        """Whether a frame sees a standing thing; at another time, whether it sees that the thing is not
+        """True if a frame sees a standing thing; at another time, if it sees that the thing is not
         there."""
         stamp_s = self.room.stamp_at(index)
         others = [

@@ -1,4 +1,4 @@
-"""What a wrong noise file costs, and what is left of it where sigma is learnt from the recording.
+"""Cost of a wrong noise file, and the rest of it where sigma is learnt from the recording.
 
 Every map of a recording is judged by the same held-out measurements under the same two noises: the given one,
 and the one that was learnt from the mapped views.

@@ -1,4 +1,4 @@
-"""What a keyframe loses when not each of its pixels has a ray of its own, and what it gains in time.
+"""Loss of a keyframe whose pixels do not each have a ray of their own, and its gain in time.
 
 On every scene the same views are mapped with every pixel, with bundles and with thinned pixels
 (inference/ray_list.py), and judged by the same held-out views.

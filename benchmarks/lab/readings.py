@@ -1,4 +1,5 @@
-"""What a map calls occupied, by its marginals, states and calibrated probabilities, beside what rays end on.
+"""Voxels that a map calls occupied, by its marginals, states and calibrated probabilities, beside the ends of
+rays.
 
 Every pixel of held-out views follows its ray to the first voxel that is called occupied, and is judged as the
 answers by the measured surface and by omega are (evaluation/accuracy.py). Beside that, how far the
@@ -181,7 +182,7 @@ def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View | None) -> 
 
 
 def _truth(scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: float) -> OccupancyTruth:
-    """What measured rays of keyframes could see."""
+    """Voxels that measured rays of keyframes could see."""
     views = [scene.views[i] for i in keyframes]
     return occupancy_truth(
         mesh,

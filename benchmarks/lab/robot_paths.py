@@ -88,7 +88,7 @@ def _around_a_path(step_m: float) -> NDArray[np.float64]:
 
 @dataclass
 class Drives:
-    """What came of some paths: how many the map trusted, how many of these were collisions, how many were
+    """Outcome of some paths: how many the map trusted, how many of these were collisions, how many were
     truly free, with PLAY_M to spare, and how many of these the map refused."""
 
     taken: int = 0

@@ -87,7 +87,7 @@ class Drive:
 
 
 def drive(seed: int, limit: int | None = None) -> Drive:
-    """What the robot measures on its way. Raises ConfigError for fewer places than one that is held out."""
+    """Measurements of the robot on its way. Raises ConfigError for fewer places than one that is held out."""
     runtime.init()
     corridor: Any = open_dataset(SCENE, color=False)
     places = range(len(corridor))[:limit]

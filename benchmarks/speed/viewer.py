@@ -148,7 +148,7 @@ class _Reader:
 
 
 def measure_viewer(run: BenchRun) -> Measured:
-    """What each keyframe costs the live view: time on the server and bytes to a browser."""
+    """Cost of each keyframe to the live view: time on the server and bytes to a browser."""
     rows = [bench_viewer(run.frames, config, advance) for config, advance in run.each_size()]
     sizes = run.options.voxel_sizes
     figures = [

@@ -157,7 +157,7 @@ def test_a_keyframe_without_points_and_one_that_is_not_there() -> None:
 
 
 def test_frozen_and_removed_keyframes() -> None:
-    """What was frozen goes on to hold others, what was removed does not."""
+    """Frozen keyframes go on to hold others, removed ones do not."""
     true = frames()[1].T_world_camera
     m = build([0, 1, 2])
     m.move_keyframe(1, moved(true, OFF))

@@ -32,7 +32,7 @@ def wall(distance_m: float) -> OrientedPoints:
 
 
 def fit(points: OrientedPoints, other: OrientedPoints, guess: Pose, config: PoseConfig) -> PairFit:
-    """Where points fit what another image has measured from the origin."""
+    """Pose at which points fit what another image has measured from the origin."""
     found = fit_to(points, surfels_of(other, np.eye(4), CELLS_M), [guess], config, 0.12)
     assert found is not None
     return found

@@ -45,7 +45,7 @@ def scan(scene: Scene, T: Pose, name: str = "scan", seed: int = 0) -> Frame:
 
 
 def followed(scene: Scene, *poses: Pose) -> Pose:
-    """Where the last scan was taken, as seen from the first; the others become keyframes."""
+    """Pose of the last scan, as seen from the first; the others become keyframes."""
     m = MRFMap(0.1, PolynomialNoise((SIGMA_M,)), max_depth=REACH_M)
     tracker = Tracker(m, PoseConfig())
     for number, T in enumerate(poses):

@@ -19,7 +19,7 @@ TIMES = np.arange(30) * 0.37
 
 
 def projected(T_camera_board: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the corners are in the image, (corners, 2)."""
+    """Places of the corners in the image, (corners, 2)."""
     seen = corner_points(BOARD) @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
     return seen[:, :2] / seen[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
 

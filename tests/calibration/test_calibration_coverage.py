@@ -1,4 +1,4 @@
-"""What is said and drawn of the parts of the view that have samples, and those that lack them."""
+"""Words and pictures on the parts of the view that have samples, and those that lack them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What signals mean to a run."""
+"""Meaning of signals to a run."""
 
 import contextlib
 import io
@@ -97,7 +97,7 @@ def leave_out(request: StopRequest, reached: list[str]) -> None:
 
 
 class Pipe(io.RawIOBase):
-    """What a program prints to, whose reader sends SIGTERM as soon as it has read the first line."""
+    """A pipe for a program's output, whose reader sends SIGTERM as soon as it has read the first line."""
 
     def __init__(self) -> None:
         self.read = b""

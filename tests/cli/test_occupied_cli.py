@@ -1,4 +1,4 @@
-"""What files and pictures of the command line call occupied: what the rays say."""
+"""Files and pictures of the command line call occupied what the rays say."""
 
 from pathlib import Path
 

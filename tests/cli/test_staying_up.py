@@ -124,7 +124,7 @@ class FartherWall(SlidingCamera):
 
 
 def kept(folder: Path, count: int, config: Config) -> MappingResult:
-    """What a run has kept that was stopped after some keyframes."""
+    """Files of a run that was stopped after some keyframes."""
     stop = StopAfter(Added, count)
     keeper = Keeper(folder, config, 0.0, lambda result: {"interrupted": True})
     return map_sequence(sequence(), config, stop.listen, should_stop=stop, keep=keeper)

@@ -1,4 +1,4 @@
-"""What the program prints: control characters as escapes, progress as lines where there is no terminal."""
+"""Output of the program: control characters as escapes, progress as lines where there is no terminal."""
 
 import io
 import logging

@@ -25,7 +25,7 @@ NAMES = tuple(f"synthetic_room_frames_{frames}_width_80_height_60" for frames in
 COARSE = ("--voxel-size", "0.1", "--runtime.arch", "cpu")
 FAST = (*COARSE, "--no-pictures")
 OF_THE_RUN = {"seconds", "peak_memory_mb"}
-"""What a report says of the run, not of the map."""
+"""Entries of a report on the run, not on the map."""
 
 
 def command(*arguments: str | Path) -> list[str]:
@@ -63,7 +63,7 @@ def assert_all_are_there_once(
 
 
 def wait_for(what: Callable[[], Any], program: "subprocess.Popen[str]") -> Any:
-    """What it gives as soon as that is true, while the program runs."""
+    """Its answer as soon as that is true, while the program runs."""
     while not (found := what()):
         assert program.poll() is None, program.communicate()
         time.sleep(0.02)
@@ -80,7 +80,7 @@ def child_in_the_middle(parent: int, out: Path, program: "subprocess.Popen[str]"
 
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    """What runs of their own make of the sources."""
+    """Maps of the sources by runs of their own."""
     found = {}
     for source in SOURCES:
         out = tmp_path_factory.mktemp("single")

@@ -1,4 +1,4 @@
-"""What tests of readers share."""
+"""Parts that tests of readers share."""
 
 from collections.abc import Callable
 from functools import partial

@@ -38,7 +38,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 Write = Callable[[Bag], None]
 AWAY = look_at([9.0, 3.0, 1.0], [2.0, 1.0, 0.0])
-"""Where the second robot's world is in the first one's."""
+"""Pose of the second robot's world in the first one's."""
 
 
 def moving(topic: str = "/tf", T: Pose = AWAY, parent: str = "odom", node: str = "") -> Write:
@@ -53,7 +53,7 @@ def moving(topic: str = "/tf", T: Pose = AWAY, parent: str = "odom", node: str =
 
 
 def placed(robot: str) -> Write:
-    """Where the camera is on a robot, in the tree of its namespace."""
+    """Place of the camera on a robot, in the tree of its namespace."""
     return partial(mounted, topic=f"{robot}/tf_static")
 
 

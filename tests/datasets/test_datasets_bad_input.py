@@ -1,4 +1,4 @@
-"""What is wrong with a source or a frame is said in one line that names it; other frames stay readable."""
+"""A fault of a source or a frame is said in one line that names it; other frames stay readable."""
 
 import gzip
 import shutil

@@ -1,4 +1,4 @@
-"""What the program says of sources, and the flags that say how one is read."""
+"""Sentences of the program on sources, and the flags that say how one is read."""
 
 import json
 import re

@@ -28,7 +28,7 @@ TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def metadata(sensor_height_m: float = 0.04) -> Any:
-    """What ouster-sdk says of a sensor of three beams."""
+    """ouster-sdk's description of a sensor of three beams."""
     T_lidar_beam, T_sensor_lidar = np.eye(4), TURNED.copy()
     T_lidar_beam[0, 3], T_sensor_lidar[2, 3] = 1000 * N_M, 1000 * sensor_height_m
     return SimpleNamespace(

@@ -39,7 +39,7 @@ print(json.dumps(found))
 
 
 def installed(folder: Path, package: str, plug: str, place: str, module: str = "") -> None:
-    """What pip leaves of a package: a module, and its metadata with an entry point."""
+    """Files that pip leaves of a package: a module, and its metadata with an entry point."""
     metadata = folder / f"{package}-1.0.dist-info"
     metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")

@@ -237,7 +237,7 @@ def test_a_las_that_claims_what_it_cannot_hold_is_refused(tmp_path: Path, data: 
 
 def test_a_panic_of_the_unpacker_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class PanicException(BaseException):
-        """What extensions in Rust raise."""
+        """Error that extensions in Rust raise."""
 
     def panic(stream: object, closefd: bool) -> None:
         raise PanicException("capacity overflow")

@@ -83,7 +83,7 @@ class Case:
 
 
 def in_tolerance(case_depth: NDArray, expected: Surveyed, tolerance: Tolerance) -> tuple[NDArray, NDArray]:
-    """Whether a pixel is right, and by how much that is so, in metres."""
+    """True if a pixel is right, and by how much that is so, in metres."""
     middle = 0.5 * (expected.near + expected.far)
     if tolerance == "voxel":
         spare = np.minimum(case_depth - expected.near, expected.far - case_depth) + 0.01 * VOXEL
@@ -212,7 +212,7 @@ def test_the_sensors_tolerance_lies_around_what_it_would_measure(measured: float
 
 
 def test_half_a_voxels_shift_of_the_grid_changes_voxel_but_not_sigma() -> None:
-    """The same measured surface, with the grid before and behind it."""
+    """One measured surface, with the grid before and behind it."""
     at_home = judged_row(ONE_WALL, 0.785)
     moved = judged_row(ONE_WALL, 0.785, camera_x=-0.5 + 0.5 * VOXEL)
     assert scores(at_home) == {"voxel": 1, "1.5sigma": 1, "5cm": 1, "sensor": 1}

@@ -99,7 +99,7 @@ def room() -> Dataset:
 
 
 def checked(room: Dataset, scale: float) -> NoiseCheck:
-    """What a map says of its noise if that is a multiple of the right one."""
+    """Check of a map's noise that is a multiple of the right one."""
     config = Config(0.05, sensor=SensorConfig(sigma_scale=scale), evaluation=EvaluationConfig(hold_out=4))
     result = map_sequence(room, config)
     check = check_noise(result.map, room, result.held_out)

@@ -1,4 +1,4 @@
-"""What tests of experiments share: small scenes on the disk."""
+"""Parts that tests of experiments share: small scenes on the disk."""
 
 from pathlib import Path
 

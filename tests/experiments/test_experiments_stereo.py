@@ -63,7 +63,7 @@ class FixedMap:
 
 
 def seen_by(m: OccupancyMap, scene: Scene, views: Sequence[SceneView], least_probability: float) -> Sightings:
-    """What some views of a scene see of a map."""
+    """Voxels of a map that some views of a scene see."""
     return sightings(m, views, scene.camera, scene.noise, scene.max_depth, least_probability)
 
 

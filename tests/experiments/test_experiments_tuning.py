@@ -29,7 +29,7 @@ COUNT = 11
 FOLDS = list(range(0, COUNT, EVERY))
 BY_NAME = {weights.contender().name: weights for weights in GRID}
 Score = Callable[[Weights, int, int, str], float]
-"""What a map with these weights scores on a view, in a fold, under a reading."""
+"""Score of a map with these weights on a view, in a fold, under a reading."""
 
 
 def scene(count: int = COUNT) -> Scene:

@@ -37,7 +37,7 @@ def layers_of(name: str, values: dict[Chunk, float]) -> Layers:
 
 
 def values(path: Path) -> dict[tuple[int, ...], float]:
-    """What a reader finds: one value for each chunk."""
+    """A reader's find: one value for each chunk."""
     store = ChunkedMap.open(path).store
     return {tuple(chunk): float(np.nanmax(store.read(LOG_ODDS, chunk))) for chunk in store.chunks.tolist()}
 

@@ -25,7 +25,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 DRIFT_M, DRIFT_RAD = 0.08, 0.02
-"""What the way may be off along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
+"""Largest error of the way along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
 
 
 def names_of(told: list[Event], kind: type) -> list[str]:

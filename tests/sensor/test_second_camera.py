@@ -46,7 +46,7 @@ def pose(eye: tuple[float, float, float], camera: Camera = CAMERA) -> Pose:
 
 
 def ranges(T: Pose, camera: Camera = CAMERA) -> NDArray[np.float32]:
-    """What the camera measures of the room's walls, exactly."""
+    """Exact depth of the room's walls at the camera."""
     along = camera.rays() @ T[:3, :3].T
     with np.errstate(divide="ignore"):
         return ((np.copysign(HALF_M, along) - T[:3, 3]) / along).min(axis=-1).astype(np.float32)

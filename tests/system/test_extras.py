@@ -1,4 +1,4 @@
-"""What a command says where the extra that it needs is not installed: one line, and exit status 2."""
+"""Error of a command whose extra is not installed: one line, and exit status 2."""
 
 import sys
 from pathlib import Path
@@ -44,7 +44,7 @@ EXPORTS = {"glb": "trimesh", "stl": "trimesh", "obj": "trimesh"}
 
 @pytest.fixture(autouse=True)
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the commands are given, in the folder that they run in."""
+    """Input of the commands, in the folder that they run in."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "corner.obj").write_text(TRIANGLE)
     (tmp_path / "poses.txt").write_text(POSES)

@@ -8,7 +8,7 @@ from taichi_mrf.system import memory
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """What the system has answered so far; it always has 1600 bytes free."""
+    """Answers of the system so far; it always has 1600 bytes free."""
     answers: list[int] = []
 
     def free() -> int:

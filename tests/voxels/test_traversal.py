@@ -21,7 +21,7 @@ from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_bricks, walk
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.compilers]
 
 EXACT = 1e-3
-"""What a segment's length may be off, in voxels."""
+"""Largest error of a segment's length, in voxels."""
 
 Shape = tuple[int, int, int]
 
@@ -110,7 +110,7 @@ class Grid:
         return bricks * BRICK + offsets_in_brick()[index % VOXELS]
 
     def exists(self, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether each voxel (n, 3) lies in a brick that exists."""
+        """Mask of the voxels (n, 3) that lie in a brick that exists."""
         return self.slots[np.ravel_multi_index(tuple(voxels.T // BRICK), self.shape)] >= 0
 
 
@@ -174,7 +174,7 @@ def clipped(grid: Grid, ray: NDArray) -> tuple[float, float]:
 
 
 def oracle(grid: Grid, rays: NDArray[np.float32], size: int = 1) -> Walked:
-    """What the engine should find, in float64: voxels, or with ``size`` BRICK bricks."""
+    """Expected finds of the engine, in float64: voxels, or with ``size`` BRICK bricks."""
     found = [segments(r[:3], r[3:6], *clipped(grid, r), size=size) for r in rays.astype(np.float64)]
     counts = np.array([len(near) for _, near, _ in found], np.int32)
     cells, near, far = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -221,7 +221,7 @@ def assert_agrees(grid: Grid, rays: NDArray[np.float32], sums_to: float = EXACT)
 
 
 def assert_contiguous(grid: Grid, rays: NDArray[np.float32], walked: Walked) -> None:
-    """Where all bricks exist, a ray's segments fill its clipped interval without a gap."""
+    """With all bricks in existence, a ray's segments fill its clipped interval without a gap."""
     tolerance = EXACT / speed(rays)
     same_ray = walked.ray[1:] == walked.ray[:-1]
     gaps = walked.near[1:] - walked.far[:-1]

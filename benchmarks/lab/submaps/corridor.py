@@ -114,7 +114,7 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
 
 
 def without_overlap(job: Job) -> Job:
-    """The same job, but for each keyframe being in the submap alone where its camera was: what cutting a
+    """The job, but for each keyframe being in the submap alone where its camera was: what cutting a
     sequence into pieces would be."""
     side = job.plan.chunks_across * CHUNK_VOXELS * job.config.voxel_size
     home = {i: (math.floor(x / side), math.floor(y / side)) for i, (x, y, _) in job.centres_m.items()}
@@ -138,7 +138,7 @@ def _settled_after(result: SubmapsResult) -> int:
 
 
 def _cost(config: Config, result: SubmapsResult, single: OccupancyMap, path: Path) -> MeasuredCost:
-    """What a keyframe of a real camera costs, and what the corridor's map takes."""
+    """Cost of a keyframe of a real camera, and time and memory of the corridor's map."""
     source = f"{NAME}?rooms=2&frames={FULL_FRAMES}&width={FULL_WIDTH}&height={FULL_HEIGHT}"
     dataset = SourceFrames(source, SourceFlags().keywords()).open()
     m = create_map(config, dataset.camera)

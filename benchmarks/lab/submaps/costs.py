@@ -1,4 +1,4 @@
-"""What maps of a building, a campus and a city need, reckoned from what was measured on the corridor."""
+"""Needs of maps of a building, a campus and a city, reckoned from what was measured on the corridor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ SECONDS_A_DAY = 86400.0
 
 @dataclass(frozen=True)
 class MeasuredCost:
-    """What one keyframe and one square metre of floor cost, as measured at one voxel size.
+    """Cost of one keyframe and of one square metre of floor, as measured at one voxel size.
 
     ``seconds`` of a CPU core for a keyframe in one submap and one round, with all of its sweeps;
     ``keyframe_mb`` that it takes in a task's memory; ``overlap`` submaps that a keyframe belongs to;
@@ -58,7 +58,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Need:
-    """What a place needs. ``task_gb`` is the memory of a task with a column of average content."""
+    """Needs of a place. ``task_gb`` is the memory of a task with a column of average content."""
 
     keyframes: float
     submaps: float

@@ -88,7 +88,7 @@ def _has_voxels(
 
 @dataclass(frozen=True)
 class KilledOnce:
-    """Where the fault strikes: the first task of ``round`` to have sent half of its first sweep's messages is
+    """Place of the fault: the first task of ``round`` to have sent half of its first sweep's messages is
     killed, and leaves a note of it."""
 
     folder: Path
@@ -96,7 +96,7 @@ class KilledOnce:
 
     @property
     def note(self) -> Path:
-        """What is left behind."""
+        """Note that is left behind."""
         return self.folder / "killed"
 
 

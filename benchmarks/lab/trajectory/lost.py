@@ -60,7 +60,7 @@ NOTES = (
 
 
 def lost_result(experiment: Experiment, case: str, config: Config) -> Result:
-    """What becomes of a camera in one of PLACES."""
+    """Result for a camera in one of PLACES."""
     seed = experiment.seeds[0]
     way, (other, start_s) = room_walk(experiment.data), PLACES[case]
     shots = [way.frame(i / RATE, f"room-{i:04d}", (seed, i)) for i in range(BEFORE)]

@@ -77,7 +77,7 @@ class Open3DTracker:
         return Peer(poses, self._cpu_s)
 
     def pose_graph(self, odometry: Peer) -> Peer:
-        """The same with a pose graph over all images."""
+        """Open3D's poses with a pose graph over all images."""
         begin = time.process_time()
         graph = self._graph.PoseGraph()
         for T_world_camera in odometry.poses.values():

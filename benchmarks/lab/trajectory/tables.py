@@ -48,7 +48,7 @@ JUDGED_HZ = 10.0
 """The maps of walks at this rate and of slower ones are judged."""
 
 _Way = tuple[str, Config, Callable[[], Result]]
-"""What found the poses, the map's configuration, and what computes the result."""
+"""Source of the poses, the map's configuration, and the function that computes the result."""
 
 NOTES = (
     f"Images of {WIDTH} x {HEIGHT} pixels, with a Kinect 1's noise where they are simulated. Moves, turns: "
@@ -150,7 +150,7 @@ def _walked(experiment: Experiment, source: Source, rate: float, voxel_size: flo
 
 
 def _lost(experiment: Experiment, case: str, voxel_size: float) -> Iterator[_Way]:
-    """The same for a camera that is covered."""
+    """Rows for a camera that is covered."""
     for name, config in configurations(voxel_size).items():
         yield name, config, lambda c=config: lost_result(experiment, case, c)  # type: ignore[misc]
 

@@ -107,7 +107,7 @@ class Way:
     def frame(
         self, seconds: float, name: str, seed: Seed, color: bool = False
     ) -> tuple[Frame, NDArray[np.float32]]:
-        """What a Kinect 1 measures at that time, and the clean depth, (H, W) in metres."""
+        """Depth that a Kinect 1 measures at that time, and the clean depth, (H, W) in metres."""
         T, camera = self.pose_at(seconds), small_camera()
         clean_m, rgb = self.picture(T, color)
         depth_m = simulate(clean_m, camera, KINECT_1, seed)
@@ -124,7 +124,7 @@ class Source:
 
 
 def walk_name(source: Source, rate: float) -> str:
-    """What a walk is called in tables and after ``--only``."""
+    """Name of a walk in tables and after ``--only``."""
     return f"{source.name}, {rate:g} Hz"
 
 
