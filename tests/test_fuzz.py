@@ -1,8 +1,8 @@
-"""Damaged input of every kind: one line that names it, or what can rightly be read of it; never a crash.
+"""Damaged input of every kind: one line that names it, or what can rightly be read of it; never a crash."""
 
-tests/support/fuzz_soak.py does the same for as long as it is told to.
-"""
-
+import faulthandler
+import random
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +28,28 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: Path) -> None:
     run_case(name, seed, root)
+
+
+@pytest.fixture
+def bounded() -> Iterator[None]:
+    """A case that takes 3 GB more than this process holds now is out of memory; one that takes longer than a
+    minute ends the run."""
+    resource = pytest.importorskip("resource", reason="limits are a POSIX feature")
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (held + 3_000_000_000, limits[1]))
+    yield
+    faulthandler.cancel_dump_traceback_later()
+    resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", [loader.name for loader in LOADERS])
+def test_many_damaged_files_are_refused_or_read_rightly(name: str, root: Path, bounded: None) -> None:
+    """Other ones each time; a failure names its seed."""
+    for _ in range(300):
+        faulthandler.dump_traceback_later(60.0, exit=True)
+        run_case(name, random.randrange(2**32), root)
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def close_calls(scan: dict[reference.Voxel, reference.Seen], *others: dict) -> b
     scans=st.integers(1, 10),
     sigma=st.sampled_from([(0.02,), (0.01, 0.0, 0.1), (0.3,)]),
     bias=st.sampled_from([(0.0,), (0.1,), (0.02, -0.03)]),
-    max_range=st.sampled_from([0.0, 1.5]),
+    max_range=st.sampled_from([0.0, 0.7]),
     max_depth=st.sampled_from([1.1, 3.0]),
     q_max=st.sampled_from([0.62, 0.7, 0.8]),
     volume=st.sampled_from([None, ((-1.2, -1.0, -2.0), (1.0, 1.2, 0.8))]),

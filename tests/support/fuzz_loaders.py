@@ -1,4 +1,4 @@
-"""Everything that reads a file, with a good input to damage: what tests/test_fuzz.py and fuzz_soak.py share.
+"""Everything that reads a file, with a good input to damage.
 
 A loader's ``read`` gives all that is in the input as bytes, so that what was read of a damaged one can be
 told from what was there before.

@@ -1,24 +1,20 @@
 """A street with dark, wet and far surfaces, and a lidar that gets no return from some of them.
 
 How much light comes back falls with reflectance, incidence and the square of range, and decides whether there
-is a return: not the law by which maps judge missing ones. As a program it prints what maps make of them.
+is a return: not the law by which maps judge missing ones.
 """
 
-import sys
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.no_return import NoReturnFit, fit_no_return
 from taichi_mrf.config.schema import Config, SensorConfig
-from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.spherical import SphericalCamera
-from taichi_mrf.system import runtime
 
 CAMERA = SphericalCamera(np.radians(np.linspace(14.0, -24.0, 32)), np.radians(np.arange(0.0, 360.0, 1.0)))
 SHIFT = np.array([0.013, 0.037, 0.11])
@@ -101,11 +97,11 @@ class Scan:
         return self.range_m == 0
 
 
-def scans(seed: int = 0, eyes: Sequence[NDArray[np.float64]] = tuple(EYES)) -> list[Scan]:
+def scans(seed: int = 0) -> list[Scan]:
     """What the lidar measures from all places."""
     rng = np.random.default_rng(seed)
     found = []
-    for eye in eyes:
+    for eye in EYES:
         ranges, reflectance, cosine = first_surface(eye, CAMERA.rays().reshape(-1, 3))
         with np.errstate(divide="ignore"):
             light_db = 10 * np.log10(reflectance * cosine) - 20 * np.log10(ranges / 40.0)
@@ -118,11 +114,8 @@ def scans(seed: int = 0, eyes: Sequence[NDArray[np.float64]] = tuple(EYES)) -> l
     return found
 
 
-def mapped(
-    sensor: SensorConfig, voxel_size: float, taken: Sequence[Scan], pass_through: float = 0.0
-) -> MRFMap:
-    inference = InferenceConfig(pass_through=pass_through)
-    m = MRFMap.from_config(Config(voxel_size=voxel_size, sensor=sensor, inference=inference), CAMERA)
+def mapped(sensor: SensorConfig, voxel_size: float, taken: Sequence[Scan]) -> MRFMap:
+    m = MRFMap.from_config(Config(voxel_size=voxel_size, sensor=sensor), CAMERA)
     for scan in taken:
         m.add_keyframe(scan.range_m, scan.T_world_camera, CAMERA, no_return=scan.no_return)
     m.infer()
@@ -166,31 +159,3 @@ def learnt(seed: int = 1) -> NoReturnFit:
     taken = scans(seed)
     true = np.concatenate([np.where(scan.true_m < REACH_M, scan.true_m, 0.0).reshape(-1) for scan in taken])
     return fit_no_return(true, np.concatenate([scan.no_return.reshape(-1) for scan in taken]))
-
-
-def main(voxel_size: float, pass_through: float) -> None:
-    """Print the figures of docs/sensors.md."""
-    runtime.init("cpu")
-    taken, fit = scans(), learnt()
-    print(f"no return {np.mean([scan.no_return.mean() for scan in taken]):.3f}", fit.fields())
-    sensors = {
-        "ignore": BASE,
-        "free 10": replace(BASE, no_return="free", no_return_depth=10.0),
-        "free 20": replace(BASE, no_return="free", no_return_depth=20.0),
-        "model": replace(BASE, no_return="model", **fit.fields()),
-    }
-    before = None
-    for name, sensor in sensors.items():
-        begin = time.perf_counter()
-        m = mapped(sensor, voxel_size, taken, pass_through)
-        seconds = time.perf_counter() - begin
-        found, surface = judged(m, taken, 40.0), m.voxels(0.5)[0]
-        before = surface if before is None else before
-        kept = float((m.occupancy(before) >= 0.5).mean())
-        print(
-            f"{name:8s} {seconds:.1f} s {found} of {len(before)} occupied voxels {kept:.4f} stay", flush=True
-        )
-
-
-if __name__ == "__main__":
-    main(float(sys.argv[1]), float(sys.argv[2]))
