@@ -225,11 +225,12 @@ def test_an_outlier_does_not_veto() -> None:
 
 def test_a_map_without_measurements_is_unknown() -> None:
     camera = PinholeCamera(8, 6, 10.0, 10.0, 3.5, 2.5)
-    m = MRFMap(0.1)
+    m = MRFMap(0.1, surface_density=2.1)
     m.add_keyframe(np.full(camera.shape, np.nan, np.float32), np.eye(4), camera)
     report = m.infer()
     assert report.rays == 0
     assert m.state([[0.0, 0.0, 1.0]])[0] == UNKNOWN
+    assert m.occupancy([[0.0, 0.0, 1.0]])[0] == pytest.approx(m.prior) == pytest.approx(-np.expm1(-2.1 * 0.1))
     assert len(m.voxels(0.0)[0]) == 0
     assert np.isnan(m.render_depth(camera, np.eye(4))).all()
 
