@@ -46,6 +46,26 @@ def test_a_run_that_is_killed_and_resumed_leaves_what_an_undisturbed_one_leaves(
     assert run.digests() == whole.digests()
 
 
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--method", "mrf"),
+        ("--method", "log_odds"),
+        ("--method", "visibility"),
+        ("--refine-poses", "--inference.sweeps", "2"),
+    ],
+)
+def test_runs_of_every_kind_that_are_killed_leave_what_undisturbed_ones_leave(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    whole = Run(tmp_path / "whole", options)
+    steps = len(whole.go())
+    for seed in range(5):
+        run = disturbed(tmp_path / f"run {seed}", random.Random(seed), steps, options)
+        assert run.digests() == whole.digests(), f"seed {seed}: {run.kills}"
+
+
 def test_what_does_not_fit_into_memory_is_named_and_the_rest_is_kept(
     tmp_path: Path, undisturbed: tuple[Run, int]
 ) -> None:

@@ -97,17 +97,6 @@ def test_time_in_two_steps_is_time_in_one(evidence: float, first: float, second:
     assert in_steps == pytest.approx(at_once, abs=1e-6)
 
 
-def test_thirty_old_views_do_not_outvote_three_new_ones() -> None:
-    free = np.zeros(())
-    for _ in range(30):
-        free = through_time(free, 1.0) - 4.0
-    newcomer = free
-    for _ in range(3):
-        newcomer = through_time(newcomer, 1.0) + 4.0
-    assert free > -12
-    assert newcomer > 0
-
-
 @pytest.mark.backends
 @pytest.mark.usefixtures("backend")
 def test_beliefs_are_the_fold_of_the_messages() -> None:

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import lidar_street
 import numpy as np
 import pytest
 import small_room
@@ -287,23 +286,6 @@ def test_edits_in_any_order_and_files_keep_it_bit_for_bit(tmp_path: Path) -> Non
     assert marginals(plain) != marginals(straight)
     straight.freeze_keyframe(0)
     straight.infer()
-
-
-@ONE_BACKEND
-def test_more_of_a_street_is_free_and_none_of_its_surfaces_is_lost() -> None:
-    """Dark, wet and far surfaces, by a law of light and range that the map does not know."""
-    taken, fit = lidar_street.scans()[::2], lidar_street.learnt()
-    assert 0.0 < fit.share < 0.2
-    assert 20.0 < fit.depth_m < 60.0
-    learnt = replace(lidar_street.BASE, no_return="model", **fit.fields())
-    plain, m = (lidar_street.mapped(sensor, 0.25, taken) for sensor in (lidar_street.BASE, learnt))
-    before, after = (lidar_street.judged(each, taken, 40.0) for each in (plain, m))
-    assert after.free_recall > before.free_recall + 0.1
-    for kind in before.occupied:
-        assert after.occupied[kind] > before.occupied[kind] - 0.01
-        assert after.freed[kind] < before.freed[kind] + 0.01
-    surface, _ = plain.voxels(0.5)
-    assert (m.occupancy(surface) >= 0.5).mean() > 0.99
 
 
 @ONE_BACKEND

@@ -1,4 +1,4 @@
-"""The map is a function of its set of keyframes, whatever happened before: on the room and on real frames."""
+"""The map is a function of its set of keyframes, whatever happened before."""
 
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from taichi_mrf.errors import KeyframeError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK
 
@@ -72,45 +71,34 @@ def test_any_history_ends_in_the_map_of_the_final_set(
     assert_same_map(m, small_room.build([names.index(name) for name in kept] + final))
 
 
-QUARTER_TURNS = [((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0))]
+ROTATIONS = [np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], turns) for turns in range(4)]
+ROTATIONS += [np.roll(np.eye(3), axes, axis=0) for axes in (1, 2)]
+"""Quarter turns around z, and those that exchange all axes."""
 
 
 @pytest.mark.parametrize("time", [TimeConfig(), TimeConfig(half_life_s=600.0)])
-@settings(max_examples=2)
-@given(bricks=st.tuples(*[st.integers(-40, 40)] * 3), turn=st.sampled_from(QUARTER_TURNS))
+@settings(max_examples=3)
+@given(bricks=st.tuples(*[st.integers(-40, 40)] * 3), R=st.sampled_from(ROTATIONS))
 def test_a_map_moves_rigidly_with_its_keyframes(
-    time: TimeConfig, bricks: tuple[int, int, int], turn: tuple[tuple[int, int], tuple[int, int]]
+    time: TimeConfig, bricks: tuple[int, int, int], R: np.ndarray
 ) -> None:
-    """By quarter turns and whole bricks, which take voxels to voxels."""
+    """By rotations and whole bricks, which take voxels to voxels."""
     here, there = (MRFMap(small_room.VOXEL_SIZE, time=time) for _ in range(2))
     T = np.eye(4)
-    T[:2, :2] = turn
+    T[:3, :3] = R
     T[:3, 3] = np.array(bricks) * BRICK * small_room.VOXEL_SIZE
     for frame in small_room.frames()[:2]:
         small_room.add(here, frame)
         id = small_room.add(there, frame)
         there.move_keyframe(id, T @ frame.T_world_camera)
     for m in (here, there):
-        m.infer()
+        m.infer(keyframes=list(m.keyframes))  # in the same order: the canonical one follows from the poses
     centres, p = here.voxels(0.0)
     moved = np.abs(there.occupancy(centres @ T[:3, :3].T + T[:3, 3]) - p)
     assert len(there.voxels(0.0)[0]) == len(p)
     # Rounding takes surfaces on a face between two voxels to either of them.
-    assert (moved <= 0.01).mean() >= 0.98
+    assert (moved <= 0.01).mean() >= 0.99
     assert moved.max() < 0.2
-
-
-def test_moving_back_and_forth_changes_nothing() -> None:
-    room = small_room.frames()
-    m = small_room.build([0, 1, 2])
-    before = m.occupancy(small_room.probes())
-    (first, *_) = m.keyframes
-    m.move_keyframe(first, room[7].T_world_camera)
-    m.infer()
-    assert np.abs(m.occupancy(small_room.probes()) - before).max() > 0.5
-    m.move_keyframe(first, room[0].T_world_camera)
-    m.infer()
-    np.testing.assert_array_equal(m.occupancy(small_room.probes()), before)
 
 
 def test_adding_and_removing_gives_back_the_map() -> None:
@@ -158,30 +146,6 @@ def test_adding_and_removing_again_and_again_takes_no_memory() -> None:
     assert m.statistics() == size
     # What one lost keyframe in ten would hold; had one in five been lost, it would show.
     assert resident_mb() - before_mb < 6 * keyframe_mb
-
-
-ELSEWHERE = np.array([-40, 25, 7]) * BRICK * small_room.VOXEL_SIZE
-"""Far away and at negative coordinates, on whose float32 a map must not depend."""
-
-
-@pytest.mark.parametrize(
-    ("axes", "shift"), [((0, 1, 2), ELSEWHERE), ((1, 2, 0), np.zeros(3)), ((2, 0, 1), np.zeros(3))]
-)
-def test_a_map_goes_to_other_bricks_and_axes_with_its_keyframes(
-    axes: tuple[int, int, int], shift: np.ndarray
-) -> None:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.eye(3)[list(axes)], shift
-    m, moved = MRFMap(small_room.VOXEL_SIZE), MRFMap(small_room.VOXEL_SIZE)
-    for frame in small_room.frames()[:3]:
-        small_room.add(m, frame)
-        small_room.add(moved, frame, T @ frame.T_world_camera)
-    # Sweep in the same order: the canonical one follows from the poses.
-    m.infer(keyframes=list(m.keyframes))
-    moved.infer(keyframes=list(moved.keyframes))
-    centres, p = m.voxels(0.0)
-    assert len(moved.voxels(0.0)[0]) == len(centres)
-    assert (np.abs(moved.occupancy(centres @ T[:3, :3].T + T[:3, 3]) - p) <= 0.01).mean() >= 0.999
 
 
 def test_freezing_keeps_the_map_and_forgets_the_image() -> None:
@@ -261,11 +225,12 @@ def test_an_outlier_does_not_veto() -> None:
 
 def test_a_map_without_measurements_is_unknown() -> None:
     camera = PinholeCamera(8, 6, 10.0, 10.0, 3.5, 2.5)
-    m = MRFMap(0.1)
+    m = MRFMap(0.1, surface_density=2.1)
     m.add_keyframe(np.full(camera.shape, np.nan, np.float32), np.eye(4), camera)
     report = m.infer()
     assert report.rays == 0
     assert m.state([[0.0, 0.0, 1.0]])[0] == UNKNOWN
+    assert m.occupancy([[0.0, 0.0, 1.0]])[0] == pytest.approx(m.prior) == pytest.approx(-np.expm1(-2.1 * 0.1))
     assert len(m.voxels(0.0)[0]) == 0
     assert np.isnan(m.render_depth(camera, np.eye(4))).all()
 
@@ -320,27 +285,3 @@ def test_tolerance_stops_early() -> None:
     report = m.infer(sweeps=50, tolerance=0.01)
     assert report.sweeps < 10
     assert report.residual <= 0.01
-
-
-@pytest.mark.shared_data
-def test_any_order_gives_the_same_map_of_real_frames(shared_data: Path) -> None:
-    dataset = open_dataset(shared_data / "seven_scenes_redkitchen")
-    kitchen: list[Frame] = [dataset.read(i) for i in (0, 3, 6, 50)]
-
-    def add(m: MRFMap, i: int) -> int:
-        return m.add_keyframe(kitchen[i].depth_m, kitchen[i].T_world_camera, kitchen[i].camera)
-
-    scratch, history = MRFMap(0.05), MRFMap(0.05)
-    for i in (0, 1, 2):
-        add(scratch, i)
-    scratch.infer()
-    gone = add(history, 3)
-    add(history, 2)
-    history.infer(sweeps=1)
-    astray = history.add_keyframe(kitchen[0].depth_m, kitchen[3].T_world_camera, kitchen[0].camera)
-    history.infer(sweeps=1, keyframes=[astray])
-    history.remove_keyframe(gone)
-    history.move_keyframe(astray, kitchen[0].T_world_camera)
-    add(history, 1)
-    history.infer()
-    assert_same_map(scratch, history)

@@ -169,6 +169,7 @@ def test_saved_maps_keep_what_keyframes_state(tmp_path: Path) -> None:
     m.save(tmp_path / "map.npz")
     loaded = MRFMap.load(tmp_path / "map.npz")
     assert marginals(loaded) == marginals(m)
+    assert dict(loaded.frozen) == dict(m.frozen) != {}
     for id, keyframe in loaded.keyframes.items():
         assert keyframe.own.content() == m.keyframes[id].own.content()
     for each in (m, loaded):

@@ -34,6 +34,7 @@ def test_the_surface_is_that_of_its_time() -> None:
     assert on_ball(now) < 0.2 * on_ball(before)
     # The room itself is the same.
     assert abs(len(now) - len(before)) < 0.2 * len(now)
+    assert m.layer("both").has_surface
     np.testing.assert_array_equal(m.layer("both").surface().vertices_m, now)
     np.testing.assert_array_equal(m.decided.surface().vertices_m, now)
 

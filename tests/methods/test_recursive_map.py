@@ -9,7 +9,7 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.schema import Config
 from taichi_mrf.config.sections import VisibilityConfig
 from taichi_mrf.errors import KeyframeError, MapFileError
 from taichi_mrf.inference.schedule import InferProgress
@@ -269,14 +269,6 @@ def test_a_stale_map_is_stale_when_it_comes_back(method: str, tmp_path: Path) ->
     np.testing.assert_array_equal(loaded.occupancy(small_room.probes()), m.occupancy(small_room.probes()))
     loaded.infer()
     assert_same_map(loaded, build(method, [1]))
-
-
-def test_parameters_survive(tmp_path: Path) -> None:
-    config = Config(0.1, "log_odds", SensorConfig(max_depth=3.0))
-    m = create_map(config, CAMERA)
-    m.save(tmp_path / "map.npz")
-    assert load_map(tmp_path / "map.npz").config.sensor.max_depth == 3.0
-    assert load_map(tmp_path / "map.npz").statistics().voxels == 0
 
 
 def test_a_map_of_another_method_says_what_it_is(tmp_path: Path) -> None:

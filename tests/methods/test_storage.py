@@ -15,42 +15,18 @@ from taichi_mrf.sensor.noise import PatchNoise
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 
-def test_a_loaded_map_answers_the_same_at_once(tmp_path: Path) -> None:
-    m = small_room.build([0, 1, 2])
-    m.save(tmp_path / "map.npz")
-    loaded = MRFMap.load(tmp_path / "map.npz")
-    probes = small_room.probes()
-    np.testing.assert_array_equal(loaded.occupancy(probes), m.occupancy(probes))
-    np.testing.assert_array_equal(loaded.state(probes), m.state(probes))
-    assert loaded.config == m.config
-    assert [k.name for k in loaded.keyframes.values()] == [k.name for k in m.keyframes.values()]
-
-
 def test_a_loaded_map_goes_on_as_if_it_had_never_been_saved(tmp_path: Path) -> None:
     m = small_room.build([0, 1])
     m.save(tmp_path / "map.npz")
     loaded = MRFMap.load(tmp_path / "map.npz")
+    assert loaded.config == m.config
+    assert [k.name for k in loaded.keyframes.values()] == [k.name for k in m.keyframes.values()]
     small_room.add(loaded, small_room.frames()[2])
     (first, *_) = loaded.keyframes
     loaded.remove_keyframe(first)
     loaded.infer()
     probes = small_room.probes()
     np.testing.assert_array_equal(loaded.occupancy(probes), small_room.build([1, 2]).occupancy(probes))
-
-
-def test_frozen_keyframes_survive(tmp_path: Path) -> None:
-    m = small_room.build([0, 1, 2])
-    (first, second, _) = m.keyframes
-    m.freeze_keyframe(first)
-    m.save(tmp_path / "map.npz")
-    loaded = MRFMap.load(tmp_path / "map.npz")
-    assert dict(loaded.frozen) == dict(m.frozen)
-    probes = small_room.probes()
-    for each in (m, loaded):
-        each.remove_keyframe(second)
-        each.infer()
-    np.testing.assert_allclose(loaded.occupancy(probes), m.occupancy(probes), atol=1e-6)
-    np.testing.assert_array_equal(loaded.state(probes), m.state(probes))
 
 
 def test_patch_noise_is_stored(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 # ruff: noqa: ANN202
-"""The steps of a scan with visibility: each equation against the oracle and against what is worked out by
-hand, and the kernels on rows of voxels that are short enough to write down."""
+"""The steps of a scan with visibility: each equation against the oracle and worked out by hand."""
 
 import math
 from dataclasses import replace
@@ -12,11 +11,9 @@ from hypothesis import strategies as st
 from oracles import visibility as reference
 
 from taichi_mrf.config.sections import VisibilityConfig
-from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
+from taichi_mrf.kernels.types import F32, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import TABLE_I
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space
@@ -94,45 +91,7 @@ def test_a_visible_voxel_follows_bayes_rule(occupied: float) -> None:
     assert interpolated(occupied, 1.0, 0.0) == pytest.approx(miss / (1 + miss), abs=1e-6)
 
 
-@given(between, probabilities)
-def test_what_is_not_visible_tells_nothing(occupied: float, inside: float) -> None:
-    assert interpolated(occupied, 0.0, inside) == pytest.approx(occupied, abs=1e-6)
-
-
-@given(between, probabilities, probabilities, probabilities)
-def test_the_further_inside_the_more_occupied(
-    occupied: float, visible: float, one: float, other: float
-) -> None:
-    less, more = sorted((one, other))
-    assert interpolated(occupied, visible, less) <= interpolated(occupied, visible, more) + 1e-6
-
-
-@given(between, probabilities, probabilities)
-def test_the_more_visible_the_more_is_learnt(occupied: float, one: float, other: float) -> None:
-    less, more = sorted((one, other))
-    assert interpolated(occupied, more, 0.0) <= interpolated(occupied, less, 0.0) + 1e-6 <= occupied + 2e-6
-    assert interpolated(occupied, more, 1.0) >= interpolated(occupied, less, 1.0) - 1e-6 >= occupied - 2e-6
-
-
-@given(st.floats(0.1, 0.6), st.floats(0.06, 0.5))
-def test_an_interpolated_miss_keeps_the_conditional_of_a_miss(visible: float, inside: float) -> None:
-    """The paper's published code takes P(H | not V) there for P(not H | not V), 0.05 for 0.95, which makes
-    a voxel that can hardly be seen almost as free as one in full view. We follow the paper."""
-    followed = interpolated(0.5, visible, inside)
-    deviating = reference.interpolated(0.5, visible, inside, TABLE_I, TABLE_I.hit_if_hidden)
-    assert followed - deviating > 0.01
-    in_view = interpolated(0.5, 1.0, inside)
-    assert abs(followed - 0.5) < abs(in_view - 0.5) or followed > 0.5
-    assert reference.interpolated(0.5, 1.0, inside, TABLE_I, TABLE_I.hit_if_hidden) == pytest.approx(in_view)
-
-
 # Equations 2, 3 and 7.
-
-
-@given(probabilities, probabilities)
-def test_visibility_never_grows_but_for_the_clamp(before: float, occluded: float) -> None:
-    after = visibility(before, occluded)
-    assert after <= before + 1e-6 or (after == 1.0 and before >= TABLE_I.q_max)
 
 
 @given(st.lists(probabilities, max_size=20))
@@ -235,98 +194,6 @@ def on_device(values: np.ndarray, dtype: object) -> "ti.Ndarray":
 def scratch(bricks: int) -> tuple["ti.Ndarray", "ti.Ndarray", "ti.Ndarray"]:
     n = max(1, bricks) * VOXELS
     return ti.ndarray(ti.f32, n), ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)
-
-
-@ti.kernel
-def _floats(bits: I32Array, out: AnyArray):
-    for i in range(out.shape[0]):
-        out[i] = ti.bit_cast(bits[i], ti.f32)
-
-
-def follow_row(
-    occluded: list[float],
-    measured: float,
-    sigma: float,
-    bias: float = 0.0,
-    max_depth: float = 100.0,
-    max_range: float = 100.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """One ray along x through the middle of a row of voxels with these P(C): P(V) and P(I) of each."""
-    length = -(-len(occluded) // BRICK)
-    window = Window((0, 0, 0), (-(-length // 8) * 8, 8, 8), VOXEL)
-    bricks = np.array([(i, 0, 0) for i in range(length)], np.int32)
-    index = WindowIndex()
-    index.fill(window, window.cells_of(bricks), np.arange(length, dtype=np.int32))
-    rows = np.arange(length * BRICK)
-    numbers = rows // BRICK * VOXELS + rows % BRICK * BRICK**2
-    hidden, visible, inside = scratch(length)
-    values = np.zeros(length * VOXELS, np.float32)
-    values[numbers[: len(occluded)]] = occluded
-    hidden.from_numpy(values)
-    visible.fill(0)
-    inside.fill(0)
-    T = np.eye(4)
-    T[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # the camera looks along x
-    T[:3, 3] = [1e-3, 0.5 * VOXEL, 0.5 * VOXEL]
-    camera = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
-    noise = PolynomialNoise((sigma,), (bias,)).table(camera)
-    scan.follow(
-        np.array([measured], np.float32), noise.sensor(camera),
-        window.viewpoint(T), index.space(window), scan.OccludedFromCentre(hidden),
-        scan.RayLimits(VOXEL, max_depth, max_range, *RULES), scan.SeenVoxels(hidden, visible, inside),
-    )  # fmt: skip
-    out = np.zeros(length * VOXELS, np.float32), np.zeros(length * VOXELS, np.float32)
-    _floats(visible, out[0])
-    _floats(inside, out[1])
-    return out[0][numbers], out[1][numbers]
-
-
-def test_a_beam_dies_after_four_unknown_voxels() -> None:
-    """The sensor's own voxel is not occluded; each unknown one leaves 0.2 * 0.5 + 1.0 * 0.5."""
-    visible, inside = follow_row([0.0] + [0.5] * 15, measured=10.0, sigma=0.01)
-    np.testing.assert_allclose(visible[:5], [1.0, 0.6, 0.36, 0.216, 0.1296], atol=1e-6)
-    np.testing.assert_array_equal(visible[5:], 0.0)
-    np.testing.assert_array_equal(inside, 0.0)
-
-
-def test_a_beam_that_is_hardly_weakened_is_not_weakened() -> None:
-    """0.2 * 0.3 + 0.7 = 0.76 is q_max or more and counts as 1, so it never adds up."""
-    visible, _ = follow_row([0.0] + [0.3] * 30, measured=10.0, sigma=0.01)
-    np.testing.assert_array_equal(visible[:31], 1.0)
-
-
-def test_a_beam_ends_one_full_hit_behind_what_it_measured() -> None:
-    """Sigma 0.1, measured 2.0: the voxels' centres lie 1, 1 and 3 sigma from it."""
-    visible, inside = follow_row([0.0] * 24, measured=2.0, sigma=0.1)
-    centre = (np.arange(24) + 0.5) * VOXEL
-    # The ray enters the row 1 mm behind its begin, so the first centre is not quite the segment's.
-    expected = [reference.inside(x - 1e-3, 2.0, 0.1) for x in centre[:12]]
-    expected[0] = reference.inside((VOXEL - 1e-3) / 2, 2.0, 0.1)
-    np.testing.assert_allclose(inside[:12], expected, atol=1e-5)
-    assert inside[11] >= scan.SURE > inside[10]
-    assert inside[12] == 1.0
-    np.testing.assert_array_equal(inside[13:], 0.0)
-    np.testing.assert_array_equal(visible[:13], 1.0)
-    np.testing.assert_array_equal(visible[13:], 0.0)
-
-
-def test_bias_shifts_the_measurement() -> None:
-    _, moved = follow_row([0.0] * 24, measured=2.3, sigma=0.1, bias=0.3)
-    _, plain = follow_row([0.0] * 24, measured=2.0, sigma=0.1)
-    np.testing.assert_allclose(moved, plain, atol=1e-5)
-
-
-@pytest.mark.parametrize("cut", [{"max_depth": 1.1}, {"max_range": 1.1}])
-def test_a_beam_that_is_cut_off_sees_free_space_alone(cut: dict[str, float]) -> None:
-    visible, inside = follow_row([0.0] * 24, measured=4.0, sigma=0.1, **cut)
-    np.testing.assert_array_equal(visible > 0, np.arange(24) < 6)
-    np.testing.assert_array_equal(inside, 0.0)
-
-
-def test_an_occupied_voxel_in_the_way_leaves_little() -> None:
-    """Behind P(C) = 0.971 is 1 - 0.8 * 0.971 = 0.2232, and behind a second such voxel less than q_min."""
-    visible, _ = follow_row([0.0, 0.0, 0.971, 0.971, 0.0], measured=10.0, sigma=0.01)
-    np.testing.assert_allclose(visible[:5], [1, 1, 0.2232, 0, 0], atol=1e-6)
 
 
 @ti.kernel

@@ -70,17 +70,6 @@ def test_rays_that_look_through_free_space_only(hand: HandMap) -> None:
     assert (~found.hit | ~found.in_unknown).all()
 
 
-def test_the_policies_agree_but_for_what_they_say_of_the_unknown(hand: HandMap) -> None:
-    origins, directions = rays(hand, 300, seed=4)
-    free, stop, hit = (cast_rays(hand, origins, directions, MAX_RANGE, u) for u in ("free", "stop", "hit"))
-    np.testing.assert_array_equal(stop.range, hit.range)
-    np.testing.assert_array_equal(hit.hit, stop.hit | stop.in_unknown)
-    assert (stop.range <= free.range).all()
-    assert not free.in_unknown.any()
-    known = ~stop.in_unknown
-    np.testing.assert_array_equal(free.range[known], stop.range[known])
-
-
 def test_one_direction_for_all_and_any_length(hand: HandMap) -> None:
     origins, _ = rays(hand, 50, seed=6)
     one = cast_rays(hand, origins, (0, -3.0, 0), MAX_RANGE)

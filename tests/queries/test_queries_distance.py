@@ -95,13 +95,16 @@ def test_inside_an_obstacle_distances_are_negative_and_zero_lies_on_its_faces(
 
 def test_distances_between_centres_are_off_by_less_than_half_a_voxel(hand: HandMap) -> None:
     points = np.random.default_rng(1).uniform(LOWER, UPPER, (300, 3))
-    away, size = from_the_nearest(hand, points)
-    found = DistanceField(hand, MAX_M).distance(points)
-    wanted = np.minimum(size - VOXEL / 2, MAX_M)
-    judged = size > VOXEL  # outside of obstacles
-    assert np.abs(found - wanted)[judged].max() < 0.5 * VOXEL
-    assert np.abs(found - wanted)[judged].mean() < 0.1 * VOXEL
-    assert len(away) == len(points)
+    first = np.floor(LOWER / VOXEL).astype(int) - 12
+    voxels = np.indices(tuple(np.ceil((UPPER - LOWER) / VOXEL).astype(int) + 24)).reshape(3, -1).T + first
+    obstacles = (voxels[hand.true_state(voxels) == 2] + 0.5) * VOXEL
+    nearest = np.array([np.linalg.norm(obstacles - point, axis=1).min() for point in points])
+    wanted = np.minimum(nearest - VOXEL / 2, MAX_M)
+    off = np.abs(DistanceField(hand, MAX_M).distance(points) - wanted)[
+        nearest > VOXEL
+    ]  # outside of obstacles
+    assert off.max() < 0.5 * VOXEL
+    assert off.mean() < 0.1 * VOXEL
 
 
 @settings(max_examples=25)  # of 20 points each
@@ -117,24 +120,6 @@ def test_the_gradient_is_that_of_the_distance(hand: HandMap, seed: int) -> None:
         aside = step * np.eye(3)[axis]
         slope = (field.distance(points + aside) - field.distance(points - aside)) / (2 * step)
         np.testing.assert_allclose(gradient[:, axis], slope, atol=1e-3)
-
-
-def test_the_gradient_leads_away_from_obstacles(hand: HandMap) -> None:
-    points = np.random.default_rng(2).uniform(LOWER, UPPER, (1000, 3))
-    away, size = from_the_nearest(hand, points)
-    judged = (size > 2 * VOXEL) & (size < MAX_M - VOXEL)
-    assert judged.sum() > 30
-    cosine = (DistanceField(hand, MAX_M).distance_and_gradient(points)[1] * away).sum(axis=1) / size
-    assert np.median(cosine[judged]) > 0.9
-
-
-def from_the_nearest(hand: HandMap, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The way from the centre of the nearest obstacle, (n, 3), and its length, (n,), all obstacles tried."""
-    first = np.floor(LOWER / VOXEL).astype(int) - 12
-    voxels = np.indices(tuple(np.ceil((UPPER - LOWER) / VOXEL).astype(int) + 24)).reshape(3, -1).T + first
-    obstacles = (voxels[hand.true_state(voxels) == 2] + 0.5) * VOXEL
-    away = points - obstacles[[np.linalg.norm(obstacles - p, axis=1).argmin() for p in points]]
-    return away, np.linalg.norm(away, axis=1)
 
 
 @pytest.mark.parametrize("unknown", RULES)
@@ -289,15 +274,14 @@ def test_the_window_grows_with_the_map(edited: Edited) -> None:
     assert field.update() == 0
 
 
-@pytest.mark.parametrize("unknown", RULES)
 @pytest.mark.parametrize("method", ["mrf", "log_odds"])
-def test_fields_of_every_method_are_those_of_their_states(backend: str, method: str, unknown: Any) -> None:
+def test_fields_of_every_method_are_those_of_their_states(backend: str, method: str) -> None:
     m = room_map(method)
     lower, upper = map_extent(m)
     box = read_box(m, lower - 1.0, upper + 1.0)
-    wanted = trimmed(transformed(box.state, unknown, 0.35, 0.1), 0.35, 0.1)
+    wanted = trimmed(transformed(box.state, "unknown", 0.35, 0.1), 0.35, 0.1)
     points = centres(np.array(box.lowest), np.array(box.lowest) + box.state.shape, 0.1)
-    found = DistanceField(m, 0.35, unknown).distance(points.reshape(-1, 3)).reshape(points.shape[:3])
+    found = DistanceField(m, 0.35, "unknown").distance(points.reshape(-1, 3)).reshape(points.shape[:3])
     np.testing.assert_allclose(trimmed(found, 0.35, 0.1), wanted, rtol=0, atol=1e-6)
 
 

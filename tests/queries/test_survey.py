@@ -218,14 +218,6 @@ def test_a_single_opaque_voxel_is_the_surface() -> None:
     assert found.likelihood[0, 0] == pytest.approx(between / 0.05, rel=1e-4)
 
 
-def test_a_voxel_is_as_opaque_as_the_ray_is_long_in_it() -> None:
-    """From within a half-opaque voxel, with 0.7 of its length ahead: 1 - p holds for a whole voxel."""
-    found = row_survey([0.0, *[THIN] * 7], measured=0.01, camera_x=0.3 * VOXEL)
-    assert found.near[0, 0] == 0
-    assert found.far[0, 0] == pytest.approx(0.7 * VOXEL, abs=1e-6)
-    assert found.visibility[0, 0] == pytest.approx(0.5**0.7, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("front", "behind", "winner"), [(0.7, 0.9, 0), (0.3, 0.9, 1), (0.5, 0.7, 0), (0.2, 0.9, 1)]
 )
@@ -240,21 +232,6 @@ def test_a_thin_voxel_can_hide_a_denser_one(front: float, behind: float, winner:
     shares = front, (1 - front) * behind
     expected = (shares[0] * 0.725 + shares[1] * 0.825) / sum(shares)
     assert found.expected[0, 0] == pytest.approx(expected, abs=1e-5)
-
-
-@pytest.mark.parametrize("behind", [THIN, 0.0, 20.0])
-def test_what_lies_behind_an_opaque_voxel_is_not_met(behind: float) -> None:
-    found = row_survey([0.1, THIN, 20.0, *[behind] * 13], measured=0.62)
-    alone = row_survey([0.1, THIN, 20.0, *[THIN] * 13], measured=0.62)
-    assert found.visibility[0, 0] < OPAQUE
-    for name in ("near", "far", "visibility", "expected", "likelihood"):
-        assert getattr(found, name) == getattr(alone, name)
-
-
-def test_a_surface_out_of_reach_is_none() -> None:
-    found = row_survey([*[THIN] * 5, 20.0, *[THIN] * 10], measured=0.3, max_depth=0.7)
-    assert found.far[0, 0] <= 0.75
-    assert found.visibility[0, 0] == pytest.approx(1.0)
 
 
 def test_a_ray_that_is_hardly_dimmed_still_has_a_mean_depth() -> None:

@@ -66,13 +66,6 @@ def test_a_ball_has_the_probability_of_its_likeliest_line(hand: HandMap, radius_
     np.testing.assert_allclose(ball(hand, points, radius_m), truth, atol=2e-5)
 
 
-def test_space_that_nobody_saw_has_the_prior_of_a_line(hand: HandMap) -> None:
-    """And space that was seen free next to nothing."""
-    far = np.array([[40.0, -30.0, 20.0]])
-    diameter = 2 * 0.3 / VOXEL
-    assert ball(hand, far, 0.3)[0] == pytest.approx(1 - (1 - UNKNOWN_P) ** diameter, rel=1e-4)
-
-
 def test_a_wall_is_one_thing_however_many_lines_meet_it(backend: str) -> None:
     """A wall that may be in any of four layers, and a ball that reaches into two of them: the lines beside
     each other add nothing, while voxels taken alone would make a collision certain."""
@@ -83,12 +76,6 @@ def test_a_wall_is_one_thing_however_many_lines_meet_it(backend: str) -> None:
     found = float(ball(wall, centre, 2 * VOXEL)[0])
     assert found == pytest.approx(0.5, abs=1e-3)
     assert 1 - 0.75 ** (np.pi * 4) > 0.95  # the voxels of the half ball, taken alone
-
-
-def test_a_larger_ball_is_never_less_likely_to_hold_something(hand: HandMap) -> None:
-    points = np.random.default_rng(4).uniform([-2, 0, -2], [1, 3, 1], (40, 3))
-    by_radius = [ball(hand, points, radius) for radius in (0.02, 0.07, 0.1, 0.18)]
-    assert (np.diff(by_radius, axis=0) >= -1e-5).all()
 
 
 def test_a_line_is_nearly_as_likely_as_in_the_exact_joint_distribution(backend: str) -> None:

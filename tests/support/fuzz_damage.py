@@ -19,21 +19,8 @@ Damage = Callable[[random.Random, bytes], bytes]
 
 WORDS = [
     *("nan", "inf", "-inf", "-1", "0", "1e309", "1e-320", "99999999999999999999", "4294967296", "2147483648"),
-    *(
-        "0x",
-        "2001-99-99",
-        "text",
-        "",
-        "[]",
-        "{}",
-        "null",
-        "true",
-        "[[" * 2000,
-        "*a",
-        "&a [*a]",
-        "!!python/x",
-        "\0",
-    ),
+    *("0x", "2001-99-99", "text", "", "[]", "{}", "null", "true", "[[" * 2000),
+    *("*a", "&a [*a]", "!!python/x", "\0"),
 ]
 """What may stand where a number or a name was."""
 
@@ -90,18 +77,8 @@ def noise(draw: random.Random, data: bytes) -> bytes:
     return draw.randbytes(draw.choice((1, 100, 5000)))
 
 
-BYTES: list[Damage] = [
-    *(
-        truncated,
-        truncated,
-        one_bit_flipped,
-        one_bit_flipped,
-        one_bit_flipped,
-        bits_flipped,
-        stretch_replaced,
-    ),
-    *(stretch_cut_out, stretch_doubled, absurd_size, absurd_size, emptied, noise),
-]
+BYTES: list[Damage] = [truncated] * 2 + [one_bit_flipped] * 3 + [bits_flipped, stretch_replaced]
+BYTES += [stretch_cut_out, stretch_doubled] + [absurd_size] * 2 + [emptied, noise]
 
 
 def word_replaced(draw: random.Random, data: bytes) -> bytes:

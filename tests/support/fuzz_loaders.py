@@ -1,4 +1,4 @@
-"""Everything that reads a file, with a good input to damage: what tests/test_fuzz.py and fuzz_soak.py share.
+"""Everything that reads a file, with a good input to damage.
 
 A loader's ``read`` gives all that is in the input as bytes, so that what was read of a damaged one can be
 told from what was there before.
@@ -25,11 +25,12 @@ from datasets_recordings import (
     arrays,
     column_by_column,
     stamped_line,
+    write_icl,
     write_image,
-    write_log,
     write_npz,
     write_numbered,
     write_record3d,
+    write_redwood,
     write_replica,
     write_scannet,
     write_seven_scenes,
@@ -252,18 +253,6 @@ def _with_camera(name: str, text: str, folder: Path) -> Path:
     write_seven_scenes(folder, CONTENT)
     (folder / "camera.txt").unlink()
     (folder / name).write_text(text)
-    return folder
-
-
-def _redwood(folder: Path) -> Path:
-    write_log(write_numbered(folder, CONTENT) / "trajectory.log", CONTENT.poses)
-    return folder
-
-
-def _icl(folder: Path) -> Path:
-    write_numbered(folder, CONTENT)
-    lines = [stamped_line(i, pose) for i, pose in enumerate(CONTENT.poses)]
-    (folder / "livingRoom2.gt.freiburg").write_text("\n".join(lines))
     return folder
 
 
@@ -494,8 +483,8 @@ LOADERS = [
     Loader("7-Scenes, camera.yaml", partial(_with_camera, "camera.yaml", CAMERA_YAML), _dataset),
     Loader("7-Scenes, intrinsics.txt", partial(_with_camera, "intrinsics.txt", K_TXT), _dataset),
     Loader("TUM RGB-D", _of(write_tum), _dataset),
-    Loader("Redwood .log", _redwood, _dataset),
-    Loader("ICL-NUIM .freiburg", _icl, _dataset),
+    Loader("Redwood .log", _of(write_redwood), _dataset),
+    Loader("ICL-NUIM .freiburg", _of(write_icl), _dataset),
     Loader("Open3D JSON", _open3d, _dataset),
     Loader("ScanNet", _of(write_scannet), _dataset),
     Loader("Replica", lambda folder: write_replica(folder, CONTENT, "."), _dataset),

@@ -1,11 +1,6 @@
-"""A spinning lidar in the built-in room that moves half a metre and turns by 30 degrees during each scan.
-
-As a program it prints how right maps are that know of the motion column by column, that take the scan's
-points to one centre, and that know nothing of it.
-"""
+"""A spinning lidar in the built-in room that moves half a metre and turns by 30 degrees during each scan."""
 
 import math
-import sys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,7 +19,6 @@ from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.simulate import simulate_model
 from taichi_mrf.sensor.spherical import SphericalCamera
-from taichi_mrf.system import runtime
 
 MOVED_M, TURNED_RAD = 0.5, math.radians(30.0)
 NOISE = PolynomialNoise((0.02,))
@@ -33,11 +27,7 @@ REACH_M = 10.0
 POINTS, DEEP_M = 200_000, 0.03
 
 Knowledge = Literal["columns", "points", "nothing"]
-WAYS: dict[Knowledge, str] = {
-    "columns": "a pose for each column",
-    "points": "points moved to one centre",
-    "nothing": "no correction",
-}
+"""Maps know a pose for each column, points moved to one centre, or nothing of the motion."""
 
 
 def lidar(rows: int, columns: int) -> SphericalCamera:
@@ -131,23 +121,3 @@ def mapped(scans: list[MovingScan], known: Knowledge, voxel_size: float) -> MRFM
         measured.add_to(m, known)
     m.infer()
     return m
-
-
-def main(moved_m: float) -> None:
-    """Print the figures of docs/sensors.md, for a sensor that moves so far during a scan."""
-    runtime.init("cpu")
-    still = lidar(64, 1024)
-    scans = [scan(number, 8, still, moved_m) for number in range(8)]
-    for voxel_size in (0.1, 0.05):
-        for known, words in WAYS.items():
-            m = mapped(scans, known, voxel_size)
-            found = score(m, 4)
-            print(
-                f"{100 * voxel_size:g} cm | {words} | {found.right:.3f} | {100 * found.median_m:.1f} cm | "
-                f"{100 * found.wrongly_free:.2f}%",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else MOVED_M)

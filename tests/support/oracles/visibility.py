@@ -5,7 +5,7 @@ dictionary of the voxels that something is known of, and rays are cut at the gri
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,19 +75,12 @@ def bayes(occupied: float, visible: float, if_occupied: float, if_free: float, i
     return of_occupied * occupied / of_any
 
 
-def interpolated(
-    occupied: float,
-    visible: float,
-    inside: float,
-    config: VisibilityConfig,
-    miss_if_hidden: float | None = None,
-) -> float:
-    """Eq. 8. ``miss_if_hidden`` puts another value in place of P(not H | not V)."""
+def interpolated(occupied: float, visible: float, inside: float, config: VisibilityConfig) -> float:
+    """Eq. 8. The paper's published code takes P(H | not V) for P(not H | not V), 0.05 for 0.95, which makes a
+    voxel that can hardly be seen almost as free as one in full view. This follows the paper."""
     c = config
-    if miss_if_hidden is None:
-        miss_if_hidden = 1 - c.hit_if_hidden
     hit = bayes(occupied, visible, c.hit_if_occupied, c.hit_if_free, c.hit_if_hidden)
-    miss = bayes(occupied, visible, 1 - c.hit_if_occupied, 1 - c.hit_if_free, miss_if_hidden)
+    miss = bayes(occupied, visible, 1 - c.hit_if_occupied, 1 - c.hit_if_free, 1 - c.hit_if_hidden)
     return inside * hit + (1 - inside) * miss
 
 
@@ -146,22 +139,11 @@ def follow(
     return scan
 
 
-def integrate(
-    known: Map,
-    scan: dict[Voxel, Seen],
-    config: VisibilityConfig,
-    miss_if_hidden: float | None = None,
-    together: Callable[[list[float]], float] = max,
-) -> Map:
-    """The map after a scan. ``together`` makes one P(V) of those of all rays; the largest P(I) wins.
-
-    ``miss_if_hidden`` goes into interpolated updates only: those with P(I) between 0.05 and 0.95.
-    """
+def integrate(known: Map, scan: dict[Voxel, Seen], config: VisibilityConfig) -> Map:
+    """The map after a scan. Of all rays the largest P(V) and the largest P(I) win."""
     after = dict(known)
     for voxel, seen in scan.items():
-        within = max(seen.inside)
-        other = miss_if_hidden if 1 - SURE < within < SURE else None
-        p = interpolated(occupancy(known, voxel), together(seen.visible), within, config, other)
+        p = interpolated(occupancy(known, voxel), max(seen.visible), max(seen.inside), config)
         after[voxel] = min(max(p, config.lowest), config.highest)
     return after
 
