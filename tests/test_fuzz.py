@@ -34,12 +34,12 @@ BY_NAME = {loader.name: loader for loader in LOADERS}
 
 
 class FuzzError(AssertionError):
-    """What must not come of a damaged file."""
+    """Outcomes that a damaged file must not have."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case; ``said`` is the error's text."""
+    """Outcome of a case; ``said`` is the error's text."""
 
     kind: str
     file: str

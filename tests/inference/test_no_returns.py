@@ -75,7 +75,7 @@ def unreturned(T: Pose, camera: PinholeCamera, law: NoReturnLaw) -> list[referen
 
 
 def in_bricks(ray: reference.Ray, voxels: set[reference.Voxel]) -> reference.Ray:
-    """Where there is no brick, rays pass."""
+    """Rays pass places without a brick."""
     kept = [i for i, s in enumerate(ray.segments) if s.voxel in voxels]
     return reference.Ray([ray.segments[i] for i in kept], [ray.densities[i] for i in kept], ray.beyond)
 

@@ -54,7 +54,7 @@ class _Record(RayVisitor):
 
 
 def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
-    """What the visitor has written down of the map's only keyframe, by voxels of the pool and by rays."""
+    """Notes of the visitor on the map's only keyframe, by voxels of the pool and by rays."""
     (k,) = m.keyframes.values()
     pool, window, index = m.view.pool, k.footprint.window, WindowIndex()
     index.fill(window, k.visible.cells, k.visible.slots)

@@ -191,7 +191,7 @@ def test_messages_with_lengths_are_those_of_the_factor(
 
 
 def test_float16_messages_move_beliefs_a_little() -> None:
-    """What the default precision costs, against the same map in float32."""
+    """Cost of the default precision, against the same map in float32."""
     rng = np.random.default_rng(3)
     camera = PinholeCamera(24, 18, 20.0, 20.0, 11.5, 8.5)
     maps = {

@@ -72,7 +72,7 @@ def test_a_parameter_of_the_wrong_type_is_named(one_backend: str) -> None:
 
 
 def calls(m: Any) -> dict[str, tuple[type[Exception], Callable[[], object]]]:
-    """What to do with a map that is wrong, by what the error says."""
+    """Wrong calls of a map, by what the error says."""
     eye = np.eye(4)
     return {
         "camera must be a camera such as PinholeCamera, not None": (

@@ -1,4 +1,4 @@
-"""What frozen keyframes measured: with ``keep_surface`` it stays a part of the surface and of the reading."""
+"""Measurements of frozen keyframes stay a part of surface and reading with ``keep_surface``."""
 
 from pathlib import Path
 

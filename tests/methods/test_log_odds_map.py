@@ -63,7 +63,7 @@ def rough_wall(seed: int = 0) -> NDArray[np.float32]:
 
 
 def near_a_face(points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether float32 may put a point into another voxel."""
+    """True if float32 may put a point into another voxel."""
     voxels = points_m / VOXEL
     return (np.abs(voxels - np.round(voxels)) < GRAZING).any(axis=-1)
 
@@ -201,7 +201,7 @@ def test_updates_are_weighed_scan_by_scan(
 
 
 def test_a_voxel_that_was_seen_is_never_unknown_again() -> None:
-    """Where a hit and a miss weigh the same their sum is 0, which stands for the unknown."""
+    """A hit and a miss of one weight add up to 0, which stands for the unknown."""
     belief, tally = ti.ndarray(ti.f32, VOXELS), ti.ndarray(ti.i64, VOXELS)
     belief.fill(0.0)
     for packed in (1 << 32, 1):
@@ -294,7 +294,7 @@ def test_a_scan_that_does_not_fit_changes_nothing() -> None:
 def octomap_voxels(
     frames: list[Frame], voxel_size: float, *, max_range: float = 0.0, discretise: bool = False
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """What OctoMap itself makes of some frames: its known voxels (n, 3) and their log-odds (n,)."""
+    """OctoMap's own map of some frames: its known voxels (n, 3) and their log-odds (n,)."""
     pyoctomap = pytest.importorskip("pyoctomap", reason="OctoMap itself is not here: pip install pyoctomap")
     tree = pyoctomap.OcTree(voxel_size)
     for frame in frames:

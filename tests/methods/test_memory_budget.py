@@ -1,4 +1,4 @@
-"""Whether one more keyframe fits: sums that are kept must be those that would be found by counting."""
+"""Room for one more keyframe: sums that are kept must be those that would be found by counting."""
 
 import numpy as np
 import pytest

@@ -56,7 +56,7 @@ EYES = (pose(0.0, 0.1, 0.05, 0.3), pose(0.6, -0.4, 0.1, 1.4))
 
 
 def ranges(camera: Camera, T: Pose) -> NDArray[np.float32]:
-    """What a camera measures of the room's walls, exactly."""
+    """Exact depth of the room's walls at a camera."""
     along = camera.rays() @ T[:3, :3].T
     starts = points_at(camera, np.zeros(camera.shape)) @ T[:3, :3].T + T[:3, 3]
     with np.errstate(divide="ignore"):

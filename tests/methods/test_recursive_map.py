@@ -1,4 +1,4 @@
-"""What maps that integrate scan by scan have in common: any history ends in the map of the final scans,
+"""Properties of all maps that integrate scan by scan: any history ends in the map of the final scans,
 what was never seen stays apart from what was, and maps come back from disk as they went."""
 
 from pathlib import Path

@@ -37,7 +37,7 @@ def near_share(a: MRFMap, b: MRFMap) -> float:
 
 
 def assert_same(a: MRFMap, b: MRFMap) -> None:
-    """The same voxels and the same probabilities, bit for bit."""
+    """Equal voxels and equal probabilities, bit for bit."""
     (centres, p), (others, q) = a.voxels(0.0), b.voxels(0.0)
     order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
     np.testing.assert_array_equal(centres[order], others[other_order])

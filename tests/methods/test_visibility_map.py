@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("backend")
 
 VOXEL = 0.2
 NEAR = VolumeConfig(dense_bricks=32)
-"""Where a map is dense (Vulkan), it need not reach far here."""
+"""Volume of a dense map (Vulkan), which need not reach far here."""
 
 STEREO = PolynomialNoise((0.0, 0.0, 0.0028))
 """0.14 pixels of disparity at a baseline of 0.12 m and a focal length of 420."""
@@ -34,7 +34,7 @@ def centres(voxels: list[reference.Voxel]) -> np.ndarray:
 
 
 def close_calls(scan: dict[reference.Voxel, reference.Seen], *others: dict) -> bool:
-    """Whether float32 could decide otherwise than float64: at q_min, at q_max, or where a ray is sure."""
+    """True if float32 could decide otherwise than float64: at q_min, at q_max, or where a ray is sure."""
     sure = any(abs(p - reference.SURE) < 1e-4 for seen in scan.values() for p in seen.inside)
     return sure or any(scan != other for other in others)
 
@@ -120,7 +120,7 @@ def test_probabilities_stay_within_their_bounds() -> None:
 
 
 def test_measurements_through_a_known_wall_are_not_believed() -> None:
-    """What OctoMap would make an artefact: wrong matches, scan by scan, 2 m behind a wall."""
+    """An artefact in OctoMap: wrong matches, scan by scan, 2 m behind a wall."""
     noise, T = PolynomialNoise((0.01,)), along((0, 0, 1), (0.1, 0.1, 0.1))
     m = VisibilityMap(VOXEL, noise, volume=NEAR, visibility=TABLE_I)
     repeat(m, 2.1, T, 60)  # a wall at z = 2.2 m

@@ -1,4 +1,4 @@
-"""What tests of queries share: maps made by hand, which nobody changes."""
+"""Parts that tests of queries share: maps made by hand, which nobody changes."""
 
 import pytest
 from hand_made import HandMade, made_at_random

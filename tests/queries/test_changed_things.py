@@ -1,4 +1,4 @@
-"""What appeared and what left between two maps, written by hand voxel by voxel."""
+"""Things that appeared and left between two maps, written by hand voxel by voxel."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where rays meet the measured surface near their likeliest voxel, against NumPy."""
+"""Depths at which rays meet the measured surface near their likeliest voxel, against NumPy."""
 
 import numpy as np
 import pytest

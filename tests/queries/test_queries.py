@@ -193,7 +193,7 @@ def test_what_is_no_ray_is_refused(random_map: HandMade, origin: tuple, directio
 
 
 LEARNT = np.log1p(np.exp(PRIOR + VolumeConfig.min_evidence))
-"""What -ln(1 - p) is where the log-odds are as far above the prior as they are in unknown space."""
+"""Value of -ln(1 - p) where the log-odds are as far above the prior as they are in unknown space."""
 
 
 def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth: float) -> NDArray:

@@ -1,4 +1,4 @@
-"""What a view would tell, against the sum over each ray's segments in float64."""
+"""Information that a view would give, against the sum over each ray's segments in float64."""
 
 import dataclasses
 

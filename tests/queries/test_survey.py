@@ -1,4 +1,4 @@
-"""What the rays of a view meet in maps made by hand, against closed forms and an oracle in float64."""
+"""Surfaces that a view's rays meet in maps made by hand, against closed forms and an oracle in float64."""
 
 import math
 
@@ -60,7 +60,7 @@ def measured_in(hand: HandMade, T: Pose, seed: int) -> NDArray[np.float32]:
 
 
 def assert_same(found: SurfaceSurvey, expected: Surveyed) -> None:
-    """Where rounding has no say. The bounds are some five times what was seen."""
+    """Mask of pixels where rounding has no say. The bounds are some five times what was seen."""
     slivers = (found.far > 0) & (found.far - found.near < SLIVER * VOXEL)
     clear = expected.clear & ~slivers
     assert clear[expected.far > 0].mean() > 0.8

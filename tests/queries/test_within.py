@@ -1,4 +1,4 @@
-"""What lies in a ball, or in the way of one: against lines cut voxel by voxel in float64, closed forms, and
+"""Content of a ball, or of the way of one: against lines cut voxel by voxel in float64, closed forms, and
 the joint distribution of a ray's voxels."""
 
 import math

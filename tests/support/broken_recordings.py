@@ -22,7 +22,7 @@ FLAGS = {
     "late": "--poses-are late=",
     "intrinsics": "--camera ",
 }
-"""What mends them, or how it begins."""
+"""Flags that mend them, or how these begin."""
 
 Break = Callable[[Sequence[Frame]], list[Frame]]
 

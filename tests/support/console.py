@@ -54,7 +54,7 @@ def taichi_mrf(
 
 @contextmanager
 def _own_log() -> Iterator[None]:
-    """What --verbose changes of the library's log ends with the program, as it does in a process."""
+    """Changes that --verbose makes to the library's log end with the program, as they do in a process."""
     log = logging.getLogger("taichi_mrf")
     level, handlers = log.level, list(log.handlers)
     try:
@@ -78,7 +78,7 @@ def as_process(
 
 
 def complaints(stderr: str) -> str:
-    """What a process printed on stderr, without the lines that say how far it is."""
+    """Lines that a process printed on stderr, without those of its progress."""
     lines = stderr.splitlines(keepends=True)
     return "".join(line for line in lines if not re.match(r"\w+ \d+( of \d+)?(, |$)", line))
 

@@ -26,7 +26,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 @dataclass
 class Content:
-    """What the frames of a recording hold: raw 16-bit depth, colour, and poses."""
+    """Content of a recording's frames: raw 16-bit depth, colour, and poses."""
 
     count: int = 5
     size: tuple[int, int] = SIZE

@@ -22,10 +22,10 @@ WORDS = [
     *("0x", "2001-99-99", "text", "", "[]", "{}", "null", "true", "[[" * 2000),
     *("*a", "&a [*a]", "!!python/x", "\0"),
 ]
-"""What may stand where a number or a name was."""
+"""Replacements for a number or a name."""
 
 SIZES = [0, 1, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 4_000_000_000]
-"""What a header may claim."""
+"""Claims of a header."""
 
 
 def truncated(draw: random.Random, data: bytes) -> bytes:

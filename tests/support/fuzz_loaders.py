@@ -141,7 +141,7 @@ def mapped(dataset: Dataset) -> None:
 
 
 def _answers(m: OccupancyMap) -> None:
-    """What a map says of itself is sound."""
+    """A map's account of itself is sound."""
     m.infer(sweeps=1)
     centres, p = m.voxels(0.0)
     assert np.isfinite(centres).all()

@@ -72,12 +72,12 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether its report says so."""
+        """True if its report says so."""
         path = self.folder / "report.json"
         return path.exists() and not json.loads(path.read_text(encoding="utf-8"))["interrupted"]
 
     def digests(self) -> dict[str, str]:
-        """What it has left, by name."""
+        """Files that it has left, by name."""
         return {name: hashlib.sha256((self.folder / name).read_bytes()).hexdigest() for name in SAME}
 
 

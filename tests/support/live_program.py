@@ -57,7 +57,7 @@ class LiveProgram:
 
     @property
     def port(self) -> int:
-        """Where the page is."""
+        """Address of the page."""
         return int(self.address.rpartition(":")[2])
 
     def group(self) -> dict[int, str]:

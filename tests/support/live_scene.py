@@ -1,4 +1,4 @@
-"""What tests of live runs share: a line to a viewer that is only a list, and what a viewer knows."""
+"""Parts that tests of live runs share: a line to a viewer that is only a list, and what a viewer knows."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -65,7 +65,7 @@ class FakeLink:
 
 @dataclass
 class Shown:
-    """What a viewer knows after some updates: the bricks of each layer, and the keyframes."""
+    """Knowledge of a viewer after some updates: the bricks of each layer, and the keyframes."""
 
     bricks: dict[str, dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
     keyframes: dict[int, KeyframeInfo] = field(default_factory=dict)
@@ -172,7 +172,7 @@ def finished(session: Session) -> MRFMap:
 
 
 def assert_shown_is(session: Session, link: FakeLink, decided: bool = True) -> None:
-    """What the viewer knows are the very voxels of the map, or, until the rays' votes are counted, those of
+    """The viewer knows the very voxels of the map, or, until the rays' votes are counted, those of
     its marginals."""
     m = session.state.mapper.map
     view = shown(link.sent)

@@ -58,7 +58,7 @@ def motion(columns: int, moved_m: float = MOVED_M, turned_rad: float = TURNED_RA
 
 @dataclass(frozen=True)
 class MovingScan:
-    """What the lidar measured at T_world_lidar, the pose in the middle of the scan."""
+    """Scan of the lidar at T_world_lidar, the pose in the middle of the scan."""
 
     T_world_lidar: Pose
     still: SphericalCamera

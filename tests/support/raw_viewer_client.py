@@ -92,7 +92,7 @@ def wait_for(condition: Callable[[], bool], what: str) -> None:
 
 
 def camera_message(**changes: Any) -> dict[str, Any]:
-    """What the stock client says first, about an eye three metres away."""
+    """First message of the stock client, about an eye three metres away."""
     return {
         "type": "ViewerCameraMessage",
         "wxyz": [1.0, 0.0, 0.0, 0.0],

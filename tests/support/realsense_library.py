@@ -99,7 +99,7 @@ class Config:
         return self.profile([])
 
     def profile(self, sensors: list[object]) -> SimpleNamespace:
-        """What a pipeline gives as it starts: images of 4 x 3 pixels, whatever is asked for."""
+        """First answer of a pipeline: images of 4 x 3 pixels, whatever is asked for."""
         intrinsics = SimpleNamespace(width=4, height=3, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
         video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
         depth = SimpleNamespace(get_depth_scale=lambda: 0.0005)

@@ -13,7 +13,7 @@ from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 
 @contextmanager
 def refusal(kind: type[TaichiMRFError], *words: str) -> Iterator[pytest.ExceptionInfo[TaichiMRFError]]:
-    """What is done here is refused in one line, which holds these words."""
+    """All that is done here is refused in one line, which holds these words."""
     with pytest.raises(kind) as caught:
         yield caught
     said = str(caught.value)
@@ -23,7 +23,7 @@ def refusal(kind: type[TaichiMRFError], *words: str) -> Iterator[pytest.Exceptio
 
 
 def refused(source: str | Path, *words: str, **options: Any) -> str:
-    """What is said of a source that cannot be opened: one line, which holds these words."""
+    """Error for a source that cannot be opened: one line, which holds these words."""
     with refusal(DatasetError, *words) as caught:
         open_dataset(source, **options)
     assert not isinstance(caught.value, FrameError)
@@ -31,7 +31,7 @@ def refused(source: str | Path, *words: str, **options: Any) -> str:
 
 
 def bad_frame(dataset: Dataset, index: int, *words: str) -> str:
-    """What is said of a frame that cannot be read: one line with these words, begun with its name."""
+    """Error for a frame that cannot be read: one line with these words, begun with its name."""
     with refusal(FrameError, *words) as caught:
         dataset.read(index)
     assert str(caught.value).startswith(f"frame {dataset.frame_names[index]}: ")

@@ -45,7 +45,7 @@ class Answer:
 
     @property
     def while_inferring(self) -> bool:
-        """Whether the map was being inferred all the time."""
+        """True if the map was being inferred all the time."""
         return self.before.startswith("sweeping") and self.after.startswith("sweeping")
 
 

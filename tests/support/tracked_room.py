@@ -15,7 +15,7 @@ from taichi_mrf.sensor.frame import Frame
 CONFIG = Config(voxel_size=0.05, evaluation=EvaluationConfig(hold_out=0))
 COUNT = 24
 START = np.eye(4)
-"""Where the walk is taken to begin; it does not say where in the room that is."""
+"""Start that the walk is taken to have; it does not say where in the room that is."""
 
 
 @cache
@@ -53,7 +53,7 @@ def walk(
 
 
 def true_pose(index: int) -> Pose:
-    """Where a frame was taken, as seen from the first."""
+    """Pose of a frame, as seen from the first."""
     return np.linalg.inv(frames()[0].T_world_camera) @ frames()[index].T_world_camera
 
 

@@ -1,4 +1,4 @@
-"""What tests of tuning share: a few small frames of the built-in room, and a coarse map's parameters."""
+"""Parts that tests of tuning share: a few small frames of the built-in room, a coarse map's parameters."""
 
 from functools import cache
 from typing import Any

@@ -54,7 +54,7 @@ def walk(m: MRFMap, places_m: Iterable[float], colored: bool = False) -> list[in
 
 
 def walk_both(m: MRFMap, other: MRFMap, places_m: Iterable[float], colored: bool = False) -> None:
-    """The same walk in a map with a window and in one without, which freezes the same keyframes when the
+    """One walk in a map with a window and in one without, which freezes the same keyframes when the
     first does."""
     for number, place_m in enumerate(places_m):
         here, there = add(m, place_m, number, colored), add(other, place_m, number, colored)

@@ -1,1 +1,1 @@
-"""What the engine is checked against: small NumPy versions in float64, written for reading, not for speed."""
+"""Oracles of the engine: small NumPy versions in float64, written for reading, not for speed."""

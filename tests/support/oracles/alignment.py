@@ -41,7 +41,7 @@ def summed(
     points: NDArray, normals: NDArray, sigmas: NDArray, T: Pose, planes: Planes, cell_size: float, *,
     reach: float, alike: float, least_weight: float, roughness: float,
 ) -> Sums:  # fmt: skip
-    """What point_to_plane.accumulate adds up; a point without a surface costs the most."""
+    """Sums of point_to_plane.accumulate; a point without a surface costs the most."""
     row_of = {tuple(cell): row for row, cell in enumerate(planes.cells.tolist())}
     out = Sums(np.zeros((6, 6)), np.zeros(6), 0.0, 0.0, 0)
     R = T[:3, :3]

@@ -93,7 +93,7 @@ def enumerate_all(factors: list[Factor], size: int) -> Enumeration:
 
 
 def is_tree(factors: list[Factor]) -> bool:
-    """Whether the graph of cells and factors has no cycle: union-find over its edges."""
+    """True if the graph of cells and factors has no cycle: union-find over its edges."""
     parent: dict[tuple[str, int], tuple[str, int]] = {}
 
     def root(node: tuple[str, int]) -> tuple[str, int]:

@@ -23,7 +23,7 @@ Voxel = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Segment:
-    """What a ray spends in one voxel, in voxel sizes."""
+    """Length of a ray in one voxel, in voxel sizes."""
 
     voxel: Voxel
     length: float
@@ -136,7 +136,7 @@ def ray_messages(
 def group_messages(
     group: Group, incoming: dict[Voxel, float], config: InferenceConfig, limits: Limits
 ) -> list[tuple[Voxel, float, float]]:
-    """The same for a group: the way in common counts for each of its rays, and has the mean of what lies
+    """Messages of a group: the way in common counts for each of its rays, and has the mean of what lies
     behind them."""
     passed, visibility = [], 1.0
     for segment in group.common:

@@ -19,7 +19,7 @@ UNDECIDED = 0.01
 
 @dataclass(frozen=True)
 class Profile:
-    """What a ray meets, voxel by voxel, (n,) each. ``near`` and ``far`` are values of the ray's own
+    """Voxels that a ray meets, (n,) each. ``near`` and ``far`` are values of the ray's own
     parameter, one unit of which is ``speed`` metres long; ``through`` is what is left at the end."""
 
     near: Vector
@@ -55,7 +55,7 @@ def profile(
 
 @dataclass(frozen=True)
 class Surveyed:
-    """What SurfaceSurvey says, of a ray or of each pixel of a view; ``clear`` where rounding has no say."""
+    """SurfaceSurvey's answer for a ray or for each pixel of a view; ``clear`` where rounding has no say."""
 
     near: Any
     far: Any

@@ -86,7 +86,7 @@ def interpolated(occupied: float, visible: float, inside: float, config: Visibil
 
 @dataclass
 class Seen:
-    """What a scan's rays have for one voxel."""
+    """Evidence of a scan's rays for one voxel."""
 
     visible: list[float] = field(default_factory=list)
     inside: list[float] = field(default_factory=list)
@@ -104,7 +104,7 @@ def follow(
     max_depth: float,
     volume: Box | None = None,
 ) -> dict[Voxel, Seen]:
-    """What all rays of a scan have for the voxels that they get to; ``volume`` is a box in metres."""
+    """Evidence of all rays of a scan for the voxels that they get to; ``volume`` is a box in metres."""
     scan: dict[Voxel, Seen] = {}
     centre = T[:3, 3]
     sensor = _voxel(np.floor(centre / voxel_size))

@@ -21,7 +21,7 @@ def cumulative(t: Array) -> Array:
 
 
 def change(distance: Array, measured: Array, angle: Array, config: WavemapConfig, voxel_size: float) -> Array:
-    """What beams add to the log-odds of points, without a limit on how far these are."""
+    """Log-odds that beams add to points, without a limit on how far these are."""
     sigma = config.range_sigma or max(voxel_size / 2, 0.05)
     f, g = (distance - measured) / sigma, angle / math.radians(config.angle_sigma_deg)
     r = cumulative(f) - cumulative(f - 3) / 2 - 0.5
@@ -34,7 +34,7 @@ def change(distance: Array, measured: Array, angle: Array, config: WavemapConfig
 def scan_change(
     centres_m: Array, T: Array, points_m: Array, config: WavemapConfig, voxel_size: float, max_range: float
 ) -> Array:
-    """What a scan adds to the log-odds of voxels: centres (N, 3) in the world, points (M, 3) measured in the
+    """Log-odds that a scan adds to voxels: centres (N, 3) in the world, points (M, 3) measured in the
     sensor's frame. Distances and angles of six sigma and ``max_range`` bound it. NaN for voxels so near such
     a bound, or to a tie between beams, that rounding decides."""
     sigma, reach = config.range_sigma or max(voxel_size / 2, 0.05), 6 * math.radians(config.angle_sigma_deg)
