@@ -51,7 +51,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put in the plan of the packages and the link to the map. Links among the repository's files become links
+    """Put in the plan of the packages and the link to the map. Links among the repository become links
     among pages, and links to files that are no pages become their names.
     """
     if FLOORS in markdown:
