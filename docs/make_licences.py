@@ -35,8 +35,7 @@ SHORT = {
 TEXT = """# Licences
 
 taichi_mrf itself is [MIT](../LICENSE). Its wheel holds no other project's code; a page that `export` writes
-holds viser's. `python docs/make_licences.py` makes the lists from what the packages state; what they bundle
-has licences of its own, which lie in the packages.
+holds viser's. `python docs/make_licences.py` makes the lists from what the packages state.
 
 ## With every installation
 
