@@ -20,7 +20,7 @@ PYTHON ?= $(shell for python in $(CANDIDATES); do \
 # them takes seconds more, and the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run check test soak lint style clean
+.PHONY: run check test soak lint style wheel clean
 
 run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
@@ -41,8 +41,12 @@ style: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+# For a release: wheel and source in dist/, checked and tried on each Python of the PATH, or on those of TRY.
+wheel: $(VENV)/.created
+	$(BIN)/python release/try_wheel.py $(TRY)
+
 clean:
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache .hypothesis *.egg-info
 
 $(VENV)/.created:
 	@test -n "$(PYTHON)" || { \

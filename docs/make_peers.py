@@ -1,14 +1,19 @@
-"""Makes the pictures of every peer in docs/evaluation.md from `taichi-mrf eval peers` (extra `bench`).
+"""Makes pictures and table of every peer in docs/evaluation.md from `taichi-mrf eval peers` (extra `bench`).
 
     python docs/make_peers.py ../shared/data
 
-The results are kept in runs/peers, so that a run that was stopped continues; all of it takes hours.
+The results are kept in runs/peers, so that a run that was stopped continues; all of it takes hours. The
+figures of the rows that docs/results/peers.csv has go there, and from there into the pages
+(result_tables.py).
 """
 
+import csv
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+import result_tables
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 IMAGES, OUT = REPOSITORY / "docs" / "images", REPOSITORY / "runs" / "peers"
@@ -23,13 +28,39 @@ PICTURES: dict[str, list[str]] = {
 
 
 def main() -> None:
-    """Run each part and copy its picture."""
+    """Run each part, copy its picture, and take its figures."""
     if len(sys.argv) != 2:
         sys.exit(__doc__)
+    figures: result_tables.Rows = {}
     for name, arguments in PICTURES.items():
         run = ["eval", "peers", "--data", sys.argv[1], "--out", str(OUT), *arguments]
         subprocess.run([sys.executable, "-m", "taichi_mrf", *run], check=True)
         shutil.copyfile(OUT / name, IMAGES / name)
+        figures |= budgets(OUT / "peers_budgets.csv")
+    path = result_tables.RESULTS / "peers.csv"
+    columns, rows = result_tables.read(path)
+    result_tables.write(path, columns, {key: figures[key] for key in rows})
+    result_tables.main()
+
+
+def budgets(path: Path) -> result_tables.Rows:
+    """The rows that the command wrote, as the page has them: the share of right pixels within 20, 150 and 500
+    ms, and the log-likelihood within 500 ms."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    found: result_tables.Rows = {}
+    for row in rows:
+        cells = [row[f"{budget} ms"] for budget in (20, 150, 500)]
+        right = [figure(cell.split(" / ")[0], 3) if "/" in cell else "-" for cell in cells]
+        likely = figure(cells[-1].split(" / ")[1], 2) if "/" in cells[-1] else "-"
+        found[row["scene"], row["voxels"], row["system"]] = [*right, likely]
+    return found
+
+
+def figure(number: str, digits: int) -> str:
+    """A number as pages write it: no zero before the point."""
+    text = f"{float(number):.{digits}f}"
+    return text.replace("0.", ".", 1) if abs(float(text)) < 1 else text
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 MkDocs calls these hooks (mkdocs.yml). Nothing is written twice: the front page is README.md, the page of
 parameters is made from the dataclasses, the API page from docstrings (api_page.py), and the plan of the
-packages from floors.yaml (floor_plan.py), the way of a depth image from its table (depth_way.py).
+packages from floors.yaml (floor_plan.py), the way of a depth image from its table (depth_way.py), a map to
+turn from the built-in room (map_page.py).
 """
 
 import dataclasses
@@ -13,6 +14,7 @@ from typing import Any
 from api_page import api_page
 from depth_way import depth_way
 from floor_plan import floor_plan
+from map_page import map_page
 from mkdocs.structure.files import File, Files
 
 from taichi_mrf.config.schema import Config
@@ -33,6 +35,9 @@ BROUGHT_IN = {
 FLOORS, WAY = "<!-- floors -->", "<!-- way -->"
 """The lines of docs/architecture.md that its two figures replace."""
 
+TURN = "**[Turn this map in your browser](map.html)**, before you install anything."
+"""Stands on the front page below its first picture."""
+
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that do not lie in docs/."""
@@ -41,17 +46,20 @@ def on_files(files: Files, config: Any) -> Files:
         files.append(File.generated(config, page, content=text))
     files.append(File.generated(config, "parameters.md", content=parameters_page()))
     files.append(File.generated(config, "api.md", content=api_page()))
+    files.append(File.generated(config, "map.html", content=map_page()))
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the plan of the packages in; links among the repository's files become links among pages, and links
-    to files that are no pages become their names.
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Put in the plan of the packages and the link to the map. Links among the repository become links
+    among pages, and links to files that are no pages become their names.
     """
     if FLOORS in markdown:
         markdown = markdown.replace(FLOORS, floor_plan()).replace(WAY, f"<div>{depth_way(markdown)}</div>")
-    for page, source in BROUGHT_IN.items():
-        markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
+    if page.file.src_uri == "index.md":
+        markdown = re.sub(r"^!\[.*$", rf"\g<0>\n\n{TURN}", markdown, count=1, flags=re.MULTILINE)
+    for name, source in BROUGHT_IN.items():
+        markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({name}\1)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/([^)]+)\)", r"](\1)", markdown)
     elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf|tests|Makefile)/?)[^)]*"

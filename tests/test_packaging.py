@@ -88,6 +88,46 @@ def test_an_installed_wheel_maps_with_a_shipped_configuration(clean_python: Path
     assert (tmp_path / "run" / "report.json").is_file()
 
 
+def dependencies(repository: Path) -> dict[str, list[str]]:
+    """The requirements of pyproject.toml without their conditions; those of every installation as ``""``."""
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
+    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    stated = {"": project["dependencies"], **project["optional-dependencies"]}
+    return {extra: [each.partition(";")[0].strip() for each in needed] for extra, needed in stated.items()}
+
+
+CONDA = {"opencv-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}
+"""Packages whose name at conda-forge is another."""
+
+
+def test_the_conda_recipe_asks_for_what_the_project_asks_for(repository: Path) -> None:
+    recipe = yaml.safe_load((repository / "release" / "conda" / "recipe.yaml").read_text(encoding="utf-8"))
+    assert recipe["context"]["version"] == taichi_mrf.__version__
+    expected = []
+    for requirement in dependencies(repository)[""]:
+        name, bounds = re.fullmatch(r"([\w-]+)(.*)", requirement).groups()
+        if name != "quadrants":  # for machines where Taichi has no wheel
+            expected.append(f"{CONDA.get(name, name)} {bounds}")
+    python, *others = recipe["requirements"]["run"]
+    assert others == expected
+    assert python.startswith("python ")
+    project = (repository / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'requires-python = ">={recipe["context"]["python_min"]},' in project
+    assert recipe["build"]["python"]["entry_points"] == ["taichi-mrf = taichi_mrf.cli.main:main"]
+    assert 'taichi-mrf = "taichi_mrf.cli.main:main"' in project
+
+
+def test_the_licence_of_each_dependency_is_listed(repository: Path) -> None:
+    text = (repository / "docs" / "licences.md").read_text(encoding="utf-8")
+    base, extras = (set(re.findall(r"[\w-]+(?=[,.](?: |\n))", part)) for part in text.split("\n## ")[1:])
+    for extra, needed in dependencies(repository).items():
+        names = {re.match(r"[\w-]+", each)[0] for each in needed}
+        if extra == "":
+            assert names - {"quadrants"} <= base
+        elif extra not in ("dev", "docs"):
+            assert names <= extras
+
+
 def test_the_citation_names_this_version(repository: Path) -> None:
     facts = yaml.safe_load((repository / "CITATION.cff").read_text(encoding="utf-8"))
     assert facts["version"] == taichi_mrf.__version__
@@ -96,11 +136,13 @@ def test_the_citation_names_this_version(repository: Path) -> None:
 
 def test_workflows_and_containers_name_what_there_is(repository: Path) -> None:
     """The folders of tests, the commands and the extras in files that no other test runs."""
-    workflow = (repository / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8")
-    for job in yaml.safe_load(workflow)["jobs"].values():
-        for word in " ".join(step.get("run", "") for step in job["steps"]).split():
-            if word.startswith(("tests/", ".ci/")):
-                assert (repository / word).exists(), word
+    named = []
+    for path in (repository / ".github" / "workflows").iterdir():
+        for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values():
+            words = " ".join(step.get("run", "") for step in job["steps"]).split()
+            named += [word for word in words if word.startswith(("tests/", ".ci/", "release/"))]
+    assert {".ci/run", "release/try_wheel.py"} < set(named)
+    assert not [word for word in named if not (repository / word).exists()]
     service = yaml.safe_load((repository / "compose.yaml").read_text(encoding="utf-8"))["services"]["live"]
     recipe = (repository / "Dockerfile").read_text(encoding="utf-8")
     assert f"CMD {json.dumps(service['command'])}" in recipe

@@ -56,6 +56,14 @@ def test_the_site_is_built_without_a_warning(site: Path) -> None:
     assert 'href="live/"' in front
 
 
+def test_a_map_to_turn_is_one_small_file_that_the_front_page_links(site: Path) -> None:
+    page = (site / "map.html").read_text(encoding="utf-8")
+    assert len(page) < 3_000_000
+    assert "default-src 'none'" in page  # nothing is loaded from a network
+    assert 'strong><a href="map.html"' in html(site, ".")
+    assert 'href="../map.html"' in html(site, "live")
+
+
 def test_every_parameter_is_on_its_page(site: Path) -> None:
     page = html(site, "parameters")
     missing = [

@@ -1,5 +1,6 @@
 """The README: its first screen, and its first example as a user pastes it."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -26,16 +27,33 @@ def test_the_first_screen_shows_a_picture_how_to_install_and_where_the_program_i
         assert needed in first_screen, needed
 
 
-def test_the_readme_is_short_and_its_table_is_that_of_the_evaluation(repository: Path) -> None:
-    """Both tables have the columns scene, voxels, system and four figures; the README has fewer rows."""
-    lines = (repository / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 150
-    measured = {}
-    for line in (repository / "docs" / "evaluation.md").read_text(encoding="utf-8").splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if len(cells) == 7:
-            measured.setdefault(tuple(cells[:3]), cells[3:])
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
-    shown = {tuple(row[:3]): row[3:] for row in rows if len(row) == 7 and row[0] not in ("scene", "---")}
-    assert len(shown) > 8
-    assert shown == {key: measured[key] for key in shown}
+def test_the_readme_is_short(repository: Path) -> None:
+    assert len((repository / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_the_figures_of_the_pages_are_those_of_the_result_files(repository: Path) -> None:
+    tables = runpy.run_path(str(repository / "docs" / "result_tables.py"))
+    _, rows = tables["read"](tables["RESULTS"] / "peers.csv")
+    for page, fewest in zip(tables["PAGES"], (9, len(rows)), strict=True):
+        text = page.read_text(encoding="utf-8")
+        assert tables["filled"](text) == text
+        told = [key for key in rows if f"\n{'| ' + ' | '.join(key)} | " in text]
+        assert len(told) >= fewest
+        one = f"| {' | '.join(told[0])} | "
+        wrong = text.replace(one, f"{one}9", 1)
+        assert wrong != text
+        assert tables["filled"](wrong) == text
+
+
+def test_the_command_of_the_peers_gives_the_figures_of_their_file(tmp_path: Path, repository: Path) -> None:
+    header = "scene,voxels,system,5 ms,10 ms,20 ms,50 ms,150 ms,500 ms"
+    row = "lidar,20 cm,wavemap,,,,0.412 / -1.20,0.493 / -0.90,0.878 / -0.71"
+    (tmp_path / "peers_budgets.csv").write_text(f"{header}\n{row}\n")
+    program = (
+        "import pathlib, make_peers\n"
+        f"print(make_peers.budgets(pathlib.Path({str(tmp_path / 'peers_budgets.csv')!r})))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=repository / "docs", capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "{('lidar', '20 cm', 'wavemap'): ['-', '.493', '.878', '-.71']}\n"
