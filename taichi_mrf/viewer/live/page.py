@@ -38,7 +38,7 @@ Edit = m.Switch | m.Move
 MOST_ASKED = 32
 """Of as many voxels in a rectangle keyframes are asked at most."""
 
-_PLAIN = ViewOptions(show="voxels")
+_PLAIN = ViewOptions("voxels by height")
 """Options that the mapping process serves unless it is asked for more."""
 
 
@@ -71,7 +71,8 @@ class Page(BasePage[Panel]):
             m.Votes: self._show_votes,
             m.Images: self.panel.show_images,
             m.TimeSpan: self.panel.time.show_span,
-            m.SceneChanges: self.panel.time.show_changes,
+            m.SceneChanges: self._take_changes,
+            m.MeasuredPoints: self._take_points,
             Clicked: self._clicked,
             Framed: self._framed,
             Dragged: self._dragged,
@@ -164,7 +165,7 @@ class Page(BasePage[Panel]):
             self.viewpoint.look_as_pictured(view)
         if view.photo and not self._in_photo:
             self._in_photo = True
-            self.panel.color_by_photo()
+            self.panel.show_in_photo_colors()
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if keyframe.state == "frozen":
@@ -172,11 +173,28 @@ class Page(BasePage[Panel]):
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
+            if self.options.shows == "points":
+                self._ask_for_extras()
         if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
             change(self.panel.unsaved, visible=True)
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
+        if self.map is not None:
+            self.map.move_measured(keyframe.id, keyframe.T_world_camera)
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)
+
+    def _take_changes(self, changes: m.SceneChanges) -> None:
+        self.panel.time.show_changes(changes)
+        if self.map is not None:
+            self.map.changes = changes.changes
+            self.map.look_changed()
+
+    def _take_points(self, measured: m.MeasuredPoints) -> None:
+        """Show what a keyframe measured, unless another one has been chosen meanwhile."""
+        if self.map is not None and measured.keyframe == self.keyframes.chosen:
+            T_world_camera = self.keyframes.keyframes[measured.keyframe].T_world_camera
+            self.map.show_measured(measured, T_world_camera)
+            self.map.look_changed()
 
     def _take_file(self, file: m.File) -> None:
         self.downloads.send(file.client, file.name, file.content)
@@ -308,7 +326,8 @@ class Page(BasePage[Panel]):
         self.keyframes.release()
         self.keyframes.choose(keyframe)
         self.panel.show_keyframes(self.keyframes.keyframes, keyframe)
-        if self.panel.images.value and self.panel.view.value == CHOSEN_KEYFRAME:
+        watched = self.panel.images.value and self.panel.view.value == CHOSEN_KEYFRAME
+        if watched or self.options.shows == "points":
             self._ask_for_extras()
 
     def _watch_images(self) -> None:
@@ -377,12 +396,13 @@ class Page(BasePage[Panel]):
             self._make(m.Switch(listed[0], False))
             self.ask(self._question)
 
-    def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
-        """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
-        of voxels, and the measured surface, which has colours of its own."""
-        by, surface = options.color_by, options.show == "surface"
-        instead = surface and self.map is not None and not self.map.growing
-        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface
+    def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool, int | None]:
+        """What the options need: the baseline's map, the counts of keyframes, the colours of voxels, the
+        measured surface, which has colours of its own, and the keyframe whose points are shown."""
+        by, surface = options.color_by, options.shows == "surface"
+        instead = options.shows == "points" or (surface and self.map is not None and not self.map.growing)
+        points = self.keyframes.chosen if options.shows == "points" else None
+        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface, points
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:
