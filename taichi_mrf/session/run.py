@@ -77,7 +77,7 @@ class Progress:
         assert self._measured is not None
         states = [entry.state for entry in mapper.roster.entries.values()]
         if replay is not None and not (replay.paused or replay.finished):
-            activity += self._time_left(replay)
+            activity += self.time_left(replay)
         return Status(
             activity,
             share,
@@ -95,7 +95,7 @@ class Progress:
             replay.speed if replay and replay.has_pace else None,
         )
 
-    def _time_left(self, replay: Replay) -> str:
+    def time_left(self, replay: Replay) -> str:
         """In words, how many frames are read, and how long the rest takes at the pace of the last ones."""
         if not replay.frames:
             return ""

@@ -380,6 +380,30 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
 
+def test_a_link_begins_with_the_view_that_it_was_made_of(
+    page: LivePage, program: LiveProgram, browser: "Browser"
+) -> None:
+    first = page.position()
+    page.page.mouse.move(400, 600)
+    page.page.mouse.wheel(0, -300)
+    page.until(lambda seen: np.linalg.norm(np.subtract(page.position(), first)) > 0.1, "another view")
+    page.pause(1.0)
+    eye = page.position()
+    page.tab("Save")
+    page.press("Link to this view")
+    page.until(lambda seen: "now leads to this view" in page.text(), "the notification")
+    link = page.page.url
+    with LivePage(browser, program.address) as other:
+        other.page.goto("about:blank")
+        other.page.goto(link)
+        other.until_settled()
+        other.pause(1.0)
+        np.testing.assert_allclose(other.position(), eye, atol=1e-3)
+        assert other.problems == []
+    page.tab("Map")
+    page.press("Fit")
+
+
 def test_two_viewers_in_a_wide_and_a_narrow_window(
     page: LivePage, program: LiveProgram, browser: "Browser"
 ) -> None:

@@ -26,11 +26,12 @@ from taichi_mrf.viewer.live.panel import (
     facts_of_many,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
-from taichi_mrf.viewer.scene.base_panel import Inbox
+from taichi_mrf.viewer.scene.base_panel import POP_UP_S, Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import change, in_markdown
+from taichi_mrf.viewer.transport.pulse import LINK
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
@@ -105,6 +106,7 @@ class Page(BasePage[Panel]):
             "Voxels (.ply)": lambda client: ask(m.Save("ply", client)),
             "Mesh (.ply)": lambda client: ask(m.Save("mesh", client)),
             "Picture (.png)": self.downloads.picture,
+            LINK: self._tell_of_link,
             "Page (.html)": self.downloads.page,
             "Recording (.viser)": self._record,
             "Close": lambda client: self.answer.clear(),
@@ -245,6 +247,13 @@ class Page(BasePage[Panel]):
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)
         self.show_counts()
+
+    def _tell_of_link(self, client: int) -> None:
+        """Say what the page's script has done in the client's browser."""
+        handle = self.server.get_clients().get(client)
+        if handle is not None:
+            text = "The address of this page now leads to this view. It is copied if the browser allows that."
+            handle.add_notification("Link", text, auto_close_seconds=POP_UP_S)
 
     def _edit(self, request_for: Callable[[m.KeyframeInfo], m.Request]) -> None:
         """Send a request about the chosen keyframe, unless it is frozen or there is none."""

@@ -16,6 +16,7 @@ from taichi_mrf.viewer.scene.coloring import LOOKS, LookName, ViewOptions
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
+from taichi_mrf.viewer.transport.pulse import LINK
 
 Point = tuple[float, float, float]
 Vote = tuple[m.KeyframeInfo, float]
@@ -73,6 +74,7 @@ SAVE_BUTTONS = {
     "Voxels (.ply)": "The voxels with probability 0.5 or more, for MeshLab, CloudCompare or Blender.",
     "Mesh (.ply)": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it.",
     "Picture (.png)": "What this browser shows.",
+    LINK: "Put what this browser looks at into the page's address, and copy that.",
     "Page (.html)": "The scene in one file that any browser opens, without a server.",
     "Recording (.viser)": "Start recording the scene; press again to get the file.",
 }

@@ -82,7 +82,7 @@ _POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
     "warning": "yellow",
     "error": "red",
 }
-_POP_UP_S = 8.0
+POP_UP_S = 8.0
 _LONGEST_POP_UP = 500
 
 
@@ -211,4 +211,4 @@ def pop_up(server: viser.ViserServer, notice: Notice) -> None:
     color = _POP_UP_COLORS[notice.severity]
     text = notice.text[:_LONGEST_POP_UP]
     for client in server.get_clients().values():
-        client.add_notification(title, text, auto_close_seconds=_POP_UP_S, color=color)
+        client.add_notification(title, text, auto_close_seconds=POP_UP_S, color=color)
