@@ -96,7 +96,8 @@ class Progress:
         )
 
     def time_left(self, replay: Replay) -> str:
-        """In words, how many frames are read, and how long the rest takes at the pace of the last ones."""
+        """In words, how long the frames that are left take at the pace of the last ones; empty if that is not
+        known."""
         if not replay.frames:
             return ""
         now, done = self._clock(), replay.number
@@ -104,10 +105,10 @@ class Progress:
             self._pace.append((now, done))
         while len(self._pace) > 2 and self._pace[1][0] < now - PACE_SECONDS:
             self._pace.popleft()
-        (since, first), text = self._pace[0], f" · frame {done} of {replay.frames}"
+        since, first = self._pace[0]
         if done - first < LEAST_FRAMES:
-            return text
-        return f"{text}, {in_words((now - since) * (replay.frames - done) / (done - first))} left"
+            return ""
+        return f", {in_words((now - since) * (replay.frames - done) / (done - first))} left"
 
     def _rate(self) -> float:
         now = self._clock()

@@ -116,6 +116,30 @@ def test_a_frozen_keyframe_cannot_be_changed(handled: LivePage) -> None:
     assert handled.asked == [m.Switch(0, on=False)]
 
 
+def test_several_keyframes_are_switched_and_taken_back_together(handled: LivePage) -> None:
+    handled.take(keyframe(2, 2.0), keyframe(3, state="off"), keyframe(4, state="frozen"), keyframe(5))
+    handled.page.panel.range.value = (1.0, 4.0)
+    handled.act("All off")
+    off = [m.Switch(1, on=False), m.Switch(2, on=False)]
+    assert handled.asked == off
+    handled.act("Undo")
+    on = [m.Switch(1, on=True), m.Switch(2, on=True)]
+    assert handled.asked == [*off, *on]
+    handled.take(keyframe(1, state="frozen"))
+    handled.act("Redo")
+    assert handled.asked[4:] == off[1:]
+    handled.act("All on")
+    assert handled.asked[5:] == [m.Switch(3, on=True)]
+
+
+def test_the_chosen_keyframe_has_a_thumbnail(handled: LivePage) -> None:
+    picture = np.full((2, 2, 3), 77, np.uint8)
+    handled.take(replace(keyframe(1), picture=picture))
+    assert handled.page.panel._thumbnail.visible
+    handled.page._choose(1)
+    np.testing.assert_array_equal(handled.page.panel._thumbnail.image, picture)
+
+
 def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> None:
     assert "Freeze" in handled.page.panel._edits.options
     handled.take(replace(HELLO, can_freeze=False))

@@ -55,8 +55,9 @@ class Page(BasePage[Panel]):
         self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
-        self._edits: list[tuple[Edit, Edit]] = []
-        """Edits that can be taken back and made again: what undoes each, and itself."""
+        self._edits: list[list[tuple[Edit, Edit]]] = []
+        """Edits that can be taken back and made again, those of one press together: what undoes each, and
+        itself."""
         self._done = 0  # how many of them are made
         self.handlers |= {
             m.Hello: self._begin,
@@ -93,6 +94,8 @@ class Page(BasePage[Panel]):
             "Leave it as it is": self.panel.close_question,
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
             "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
+            "All off": lambda client: self._switch_range(False),
+            "All on": lambda client: self._switch_range(True),
             "Freeze": self._freeze,
             "Freeze it": self.panel.agree,
             "Move": lambda client: self._toggle_gizmo(),
@@ -262,17 +265,28 @@ class Page(BasePage[Panel]):
             request = request_for(chosen)
             self._make(request) if isinstance(request, Edit) else self.ask(request)
 
-    def _make(self, edit: Edit) -> None:
-        """Send an edit that can be taken back."""
-        before = self.keyframes.keyframes[edit.keyframe]
-        if isinstance(edit, m.Switch):
-            back: Edit = m.Switch(edit.keyframe, before.state == "on")
-        else:
-            back = m.Move(edit.keyframe, before.T_world_camera)
-        self._edits[self._done :] = [(back, edit)]
-        self._done += 1
-        self._show_history()
-        self.ask(edit)
+    def _make(self, *edits: Edit) -> None:
+        """Send edits that can be taken back together."""
+        pairs: list[tuple[Edit, Edit]] = []
+        for edit in edits:
+            before = self.keyframes.keyframes[edit.keyframe]
+            if isinstance(edit, m.Switch):
+                pairs.append((m.Switch(edit.keyframe, before.state == "on"), edit))
+            else:
+                pairs.append((m.Move(edit.keyframe, before.T_world_camera), edit))
+        if pairs:
+            self._edits[self._done :] = [pairs]
+            self._done += 1
+            self._show_history()
+        for edit in edits:
+            self.ask(edit)
+
+    def _switch_range(self, on: bool) -> None:
+        """Switch all keyframes from one number to another on or off."""
+        first, last = self.panel.range.value
+        state = "off" if on else "on"
+        known = sorted(self.keyframes.keyframes.items())
+        self._make(*(m.Switch(id, on) for id, each in known if first <= id <= last and each.state == state))
 
     def _redo(self, back: bool = False) -> None:
         """Make the next edit again, or take the last one ``back``."""
@@ -280,13 +294,14 @@ class Page(BasePage[Panel]):
         if 0 <= place < len(self._edits):
             self._done = place + (not back)
             self._show_history()
-            self.ask(self._edits[place][0 if back else 1])
+            for pair in self._edits[place]:
+                self.ask(pair[0 if back else 1])
 
     def _forget_edits(self, keyframes: Collection[int]) -> None:
         """Edits of these keyframes can no longer be taken back."""
-        kept = [edit[1].keyframe not in keyframes for edit in self._edits]
-        self._done = sum(kept[: self._done])
-        self._edits = [edit for edit, keep in zip(self._edits, kept, strict=True) if keep]
+        left = [[pair for pair in pairs if pair[1].keyframe not in keyframes] for pairs in self._edits]
+        self._done = sum(map(bool, left[: self._done]))
+        self._edits = [pairs for pairs in left if pairs]
         self._show_history()
 
     def _show_history(self) -> None:

@@ -213,10 +213,13 @@ class Panel(BasePanel):
         for widget in (self.position, self.pixel, self._pixel_button):
             change(widget, disabled=fixed)
         change(self._edits, visible=not fixed)  # viser cannot disable a row of buttons
+        change(self._thumbnail, visible=chosen is not None)
         if chosen is None:
             self._keyframe_text.content = ""
             return
         info = keyframes[chosen]
+        if info.picture is not self._thumbnail_of:
+            self._thumbnail_of = self._thumbnail.image = info.picture
         self.position.value = tuple(np.round(info.T_world_camera[:3, 3], 4).tolist())
         text = f"{info.rays:,} measured pixels"
         self._keyframe_text.content = in_markdown(f"{text}; frozen: it cannot be changed" if fixed else text)
@@ -269,6 +272,12 @@ class Panel(BasePanel):
             gui.add_vector3("Position (m)", (0.0, 0.0, 0.0), step=POSITION_STEP_M, hint=hint)
         )
         self._keyframe_text = gui.add_markdown("")
+        self._thumbnail = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
+        self._thumbnail_of: NDArray[np.uint8] | None = None
+        hint = "Numbers of the first and the last keyframe that the buttons below switch."
+        self.range: Any = gui.add_vector2("From, to", (0.0, 0.0), min=(0.0, 0.0), step=1.0, hint=hint)
+        hint = "Remove all these keyframes from the map, or add them again; Undo takes that back at once."
+        self.add_buttons("Several", ("All off", "All on"), hint)
         gui.add_markdown(
             "**On/off** removes the keyframe from the map, or adds it again. **Freeze** asks, and then makes "
             "its evidence permanent and drops its image. **Move** shows a gizmo: drag it, and the map "
