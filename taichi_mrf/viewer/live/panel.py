@@ -95,6 +95,7 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
+        self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
@@ -273,7 +274,6 @@ class Panel(BasePanel):
         )
         self._keyframe_text = gui.add_markdown("")
         self._thumbnail = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
-        self._thumbnail_of: NDArray[np.uint8] | None = None
         hint = "Numbers of the first and the last keyframe that the buttons below switch."
         self.range: Any = gui.add_vector2("From, to", (0.0, 0.0), min=(0.0, 0.0), step=1.0, hint=hint)
         hint = "Remove all these keyframes from the map, or add them again; Undo takes that back at once."
