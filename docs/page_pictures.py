@@ -56,12 +56,10 @@ def live_cut(page: LivePage) -> Image.Image:
 def live_surface(page: LivePage) -> Image.Image:
     """The measured surface by height, without the widgets."""
     page.tab("Map")
-    page.select("Color by", "height")
-    page.select("Show", "surface")
+    page.select("Look", "surface by height")
     page.until(lambda seen: seen.settled and seen.triangles, "the surface")
     picture = shot(page).crop((0, 150, 940, 770)).resize((480, 317), Image.Resampling.LANCZOS)
-    page.select("Show", "voxels")
-    page.select("Color by", "probability")
+    page.select("Look", "voxels by probability")
     page.until_settled()
     return picture
 
@@ -69,8 +67,7 @@ def live_surface(page: LivePage) -> Image.Image:
 def live_lidar(page: LivePage) -> Image.Image:
     """A building by lidar without its roof, from nearer, without the widgets."""
     page.tab("Map")
-    page.tick("Dynamic", on=False)
-    page.select("Color by", "height")
+    page.select("Look", "voxels by height")
     level_cut(page, 0.45)
     page.until_settled()
     page.page.mouse.move(480, 430)
@@ -83,7 +80,7 @@ def live_lidar(page: LivePage) -> Image.Image:
 def live_keyframes(page: LivePage) -> Image.Image:
     """A keyframe with the gizmo that moves it, the map coloured by the number of keyframes."""
     page.tab("Map")
-    page.select("Color by", "keyframes")
+    page.select("Look", "voxels by keyframes")
     page.tab("Keyframes")
     page.select("Keyframe", re.compile("room-0009"))
     page.press("Move")
@@ -91,7 +88,7 @@ def live_keyframes(page: LivePage) -> Image.Image:
     picture = shot(page)
     page.press("Move")
     page.tab("Map")
-    page.select("Color by", "probability")
+    page.select("Look", "voxels by probability")
     page.until_settled()
     return picture
 

@@ -17,7 +17,7 @@ from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import ColorBy, ViewOptions, probabilities, voxel_colors
+from taichi_mrf.viewer.scene.coloring import LookName, ViewOptions, probabilities, voxel_colors
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, look_of
 from taichi_mrf.viewer.scene.voxel_store import Chunk, Shown, VoxelStore, facing
@@ -43,7 +43,7 @@ def write_page(
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
     map's), by their marginals or in the colours of ``colored``, the same map; with ``cells`` also the cells
     that stand in for voxels (queries/cells.py). Raises MapFileError, ViewerError."""
-    color_by: ColorBy = "probability" if colored is None else "photo"
+    look_name: LookName = "voxels by probability" if colored is None else "voxels in photo colours"
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
@@ -59,7 +59,7 @@ def write_page(
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
-            options = ViewOptions(color_by=color_by, threshold=threshold)
+            options = ViewOptions(look_name, threshold)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
             layer.prepare(look, everything=True, exactly=True)
             layer.send()

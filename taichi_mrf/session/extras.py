@@ -36,6 +36,7 @@ class Extras:
         self._surface: ShownSurface | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
+        self._points_of: int | None = None
 
     def watch(self, wanted: Watch) -> None:
         """Set what the page shows; the work is done later."""
@@ -50,13 +51,14 @@ class Extras:
     def start_again_for_viewer(self) -> None:
         """Show no extras, which a new viewer starts without; it is sent the list of changes."""
         self._watch, self._baseline, self._colors, self._surface = NOTHING, None, None, None
+        self._points_of = None
         if self._changes is not None:
             self._run.send(self._changes.listed())
 
     def start_over(self) -> None:
         """Start over with a new map; the page shows the same extras."""
         self._baseline, self._changes, self._colors, self._surface = None, None, None, None
-        self._shown_version = -1
+        self._shown_version, self._points_of = -1, None
 
     def work(self, go_on: GoOn) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``go_on`` can stop it."""
@@ -66,6 +68,8 @@ class Extras:
             self._run.publish()
             return True
         if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
+            return True
+        if self._send_points():
             return True
         if self._decide(go_on) or self._send_surface(go_on):
             return True
@@ -82,8 +86,10 @@ class Extras:
             return True
 
     def answer(self) -> None:
-        """During inference: make images of a newly chosen view, from the map before inference."""
+        """During inference: make images of a newly chosen view, from the map before inference, and show the
+        points of a newly chosen keyframe."""
         self._make_images()
+        self._send_points()
 
     def _catch_up(self, go_on: GoOn) -> bool:
         mapper = self._run.mapper
@@ -113,6 +119,17 @@ class Extras:
         if self._colors is None:
             self._colors = ShownColors(self._run.mapper)
         return self._send_found(self._colors.changes)
+
+    def _send_points(self) -> bool:
+        """Send what a newly chosen keyframe measured; False if none was chosen."""
+        wanted, before = self._watch.points, self._points_of
+        if wanted is not None and wanted not in self._run.mapper.roster.entries:
+            return False
+        self._points_of = wanted
+        if wanted is None or wanted == before:
+            return False
+        self._run.guarded(lambda: self._run.send(self._run.mapper.points_of(wanted)))
+        return True
 
     def _send_found(self, find: Callable[[], Sequence[Update]]) -> bool:
         """Send the updates that are found, if finding them raises nothing; False if there are none."""

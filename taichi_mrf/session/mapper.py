@@ -25,12 +25,16 @@ from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
-from taichi_mrf.session.pictures import thumbnail
+from taichi_mrf.session.pictures import depth_colors, thumbnail
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeState
+
+MOST_POINTS = 200_000
+"""Of as many measured points of a keyframe are shown at most."""
 
 
 @dataclass
@@ -315,6 +319,19 @@ class Mapper:
     def depth_of(self, entry: LiveKeyframe) -> NDArray[np.float32] | None:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
+
+    def points_of(self, id: int) -> messages.MeasuredPoints:
+        """What a keyframe measured, :data:`MOST_POINTS` points at most. Raises KeyframeError."""
+        entry = self.roster.find(id)
+        depth_m = self.depth_of(entry)
+        if depth_m is None:
+            return messages.MeasuredPoints(id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+        seen = self._keyframe(entry).color if entry.state == "on" else entry.color
+        colors = depth_colors(depth_m) if seen is None else seen
+        there = np.isfinite(depth_m) & (depth_m > 0)
+        every = -(-int(there.sum()) // MOST_POINTS) or 1
+        points_m = points_at(entry.camera, depth_m)[there][::every].astype(np.float32)
+        return messages.MeasuredPoints(id, points_m, colors[there][::every])
 
     def posed_image(self, entry: LiveKeyframe) -> StoredKeyframe:
         """A keyframe by the viewer's number, for the rays of its pixels. Raises KeyframeError for a frozen

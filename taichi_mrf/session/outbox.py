@@ -23,6 +23,7 @@ from taichi_mrf.viewer.messages import (
     Images,
     KeyframeInfo,
     Layer,
+    MeasuredPoints,
     Notice,
     Quit,
     RayAnswer,
@@ -42,7 +43,9 @@ BRICKS_AT_ONCE = 2048
 MOST = {Notice: 50, File: 4}
 """Most updates of these kinds that wait; the oldest are dropped first."""
 
-LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, Votes, TimeSpan, SceneChanges, SurfaceView)
+LATEST_ONLY = (
+    Status, CurrentCamera, Images, MeasuredPoints, RayAnswer, Votes, TimeSpan, SceneChanges, SurfaceView,
+)  # fmt: skip
 
 MERGE_FACTOR = 2
 """Waiting bricks are merged when their number has grown by this factor since the last merge, so that each is

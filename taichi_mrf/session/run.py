@@ -35,12 +35,28 @@ RATE_SECONDS = 5.0
 """Seconds over which the keyframe rate is averaged."""
 
 
+PACE_SECONDS = 30.0
+"""Seconds over which the pace of frames is averaged that the time left is computed from."""
+
+LEAST_FRAMES = 3
+"""No time is given before so many frames have been read."""
+
+
+def in_words(seconds: float) -> str:
+    """About how long something takes, in steps that do not flicker."""
+    if seconds < 60:
+        return f"about {max(5, 5 * round(seconds / 5))} s"
+    minutes = round(seconds / 60)
+    return f"about {minutes} min" if minutes < 90 else f"about {round(minutes / 60)} h"
+
+
 class Progress:
     """Makes Status messages."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._taken: deque[float] = deque()
+        self._pace: deque[tuple[float, int]] = deque()  # frames that were read by some times
         self._begin = clock()
         self._measured: MapStatistics | None = None
 
@@ -60,6 +76,8 @@ class Progress:
             self.measure(mapper)
         assert self._measured is not None
         states = [entry.state for entry in mapper.roster.entries.values()]
+        if replay is not None and not (replay.paused or replay.finished):
+            activity += self.time_left(replay)
         return Status(
             activity,
             share,
@@ -76,6 +94,21 @@ class Progress:
             waiting or mapper.edited,
             replay.speed if replay and replay.has_pace else None,
         )
+
+    def time_left(self, replay: Replay) -> str:
+        """In words, how long the frames that are left take at the pace of the last ones; empty if that is not
+        known."""
+        if not replay.frames:
+            return ""
+        now, done = self._clock(), replay.number
+        if not self._pace or self._pace[-1][1] != done:
+            self._pace.append((now, done))
+        while len(self._pace) > 2 and self._pace[1][0] < now - PACE_SECONDS:
+            self._pace.popleft()
+        since, first = self._pace[0]
+        if done - first < LEAST_FRAMES:
+            return ""
+        return f", {in_words((now - since) * (replay.frames - done) / (done - first))} left"
 
     def _rate(self) -> float:
         now = self._clock()

@@ -29,7 +29,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.queries.changed_things import find_changed_things, without_slack
-from taichi_mrf.queries.colored import marginals_behind, painted
+from taichi_mrf.queries.colored import painted
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.session.publish import Publisher
@@ -41,13 +41,10 @@ from taichi_mrf.viewer.messages import (
     SurfacePatch,
     SurfaceView,
     Update,
-    pack_log_odds,
 )
 from taichi_mrf.voxels.layout import BRICK, VOXELS, by_chunk, grid_keys
 
 Chunk = tuple[int, int, int]
-
-_SUREST = 1 - 1e-6
 
 
 class ShownSurface:
@@ -91,7 +88,6 @@ class ShownSurface:
     def _by_chunk(self, surface: DrawnSurface, std_m: NDArray[np.float32]) -> dict[Chunk, SurfacePatch]:
         m = self._mapper.map
         normals = np.rint(127 * surface.normals).astype(np.int8)
-        log_odds = pack_log_odds(_log_odds(marginals_behind(m, surface.vertices_m, surface.normals)))
         found: dict[Chunk, SurfacePatch] = {}
         first = surface.vertices_m[surface.triangles[:, 0]]
         bricks = np.floor(first / (BRICK * m.voxel_size)).astype(np.int32)
@@ -103,7 +99,6 @@ class ShownSurface:
                 corners.reshape(-1, 3).astype(np.int32),
                 normals[used],
                 std_m[used],
-                log_odds[used],
                 None if surface.colors is None else surface.colors[used],
             )
         return found
@@ -153,21 +148,15 @@ def _without_triangles(chunk: Chunk) -> SurfacePatch:
         nothing.astype(np.int32),
         nothing.astype(np.int8),
         np.zeros(0, np.float32),
-        np.zeros(0, np.int16),
         None,
     )
 
 
 def _digest(patch: SurfacePatch) -> bytes:
     hashed = hashlib.blake2b(digest_size=8)
-    for part in (patch.vertices_m, patch.triangles, patch.std_m, patch.log_odds, patch.colors):
+    for part in (patch.vertices_m, patch.triangles, patch.std_m, patch.colors):
         hashed.update(b"" if part is None else np.ascontiguousarray(part).tobytes())
     return hashed.digest()
-
-
-def _log_odds(p: NDArray[np.float32]) -> NDArray[np.float32]:
-    within = np.clip(p.astype(np.float64), 1 - _SUREST, _SUREST)
-    return np.log(within / (1 - within)).astype(np.float32)
 
 
 MOST_LISTED = 6

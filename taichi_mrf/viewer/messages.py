@@ -102,8 +102,7 @@ class SurfacePatch(Update):
 
     ``vertices_m`` (n, 3) float32 in metres, world; ``triangles`` (m, 3) int32, counter-clockwise as seen from
     free space; ``normals`` (n, 3) int8, 127 is one; ``std_m`` (n,) float32, the standard deviation along the
-    normal; ``log_odds`` (n,) int16 of the likeliest voxel there, see :data:`LOG_ODDS_STEP`; ``colors`` (n, 3)
-    uint8 RGB that cameras saw, None if the map has none.
+    normal; ``colors`` (n, 3) uint8 RGB that cameras saw, None if the map has none.
     """
 
     chunk: tuple[int, int, int]
@@ -111,7 +110,6 @@ class SurfacePatch(Update):
     triangles: NDArray[np.int32]
     normals: NDArray[np.int8]
     std_m: NDArray[np.float32]
-    log_odds: NDArray[np.int16]
     colors: NDArray[np.uint8] | None
 
 
@@ -153,6 +151,16 @@ class KeyframeInfo(Update):
     picture: NDArray[np.uint8]
     crossed: NDArray[np.int32]
     T_home: Pose | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredPoints(Update):
+    """What a keyframe measured: ``points_m`` (n, 3) float32 in metres, in its camera frame, and ``colors``
+    (n, 3) uint8 RGB, of its colour image or else those of depth; none of a frozen keyframe."""
+
+    keyframe: int
+    points_m: NDArray[np.float32]
+    colors: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -378,7 +386,8 @@ class PixelRay(Request):
 class Watch(Request):
     """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
     keyframe, or None for the current camera), the baseline beside the map, the ``counts`` of keyframes that
-    see each voxel (else sent as 0), the ``colors`` of voxels, and the measured ``surface``."""
+    see each voxel (else sent as 0), the ``colors`` of voxels, the measured ``surface``, and the measured
+    ``points`` of a keyframe."""
 
     images: bool
     view: int | None
@@ -386,6 +395,7 @@ class Watch(Request):
     counts: bool = False
     colors: bool = False
     surface: bool = False
+    points: int | None = None
 
 
 @dataclass(frozen=True)

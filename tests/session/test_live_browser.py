@@ -153,13 +153,13 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
         ("uncertainty", "bits"),
         ("keyframes", "see the voxel"),
     ]:
-        page.select("Color by", mode)
+        page.select("Look", f"voxels by {mode}")
         seen = page.until(lambda seen: seen.colors not in known and seen.agrees, f"colours by {mode}")
         page.until(lambda seen, legend=legend: legend in page.text(), f"the scale of {mode}")
         page.screenshot(f"colours_{mode}")
         known.add(seen.colors)
         assert seen.voxels == first.voxels
-    page.select("Color by", "height")
+    page.select("Look", "voxels by height")
     page.until(lambda seen: seen.colors == first.colors, "the first colours")
 
 
@@ -186,7 +186,7 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
 
 
 def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) -> None:
-    page.select("Show", "surface")
+    page.select("Look", "surface by height")
     expected = len(saved.surface().triangles)
     seen = page.until(lambda seen: seen.agrees and seen.triangles == expected, "the surface")
     assert seen.voxels == 0
@@ -196,8 +196,31 @@ def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) ->
     x, y, _ = page.free_places(corner[:20])[0]
     page.click(x, y)
     page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
-    page.select("Show", "voxels")
+    page.select("Look", "voxels by height")
     page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "voxels again")
+
+
+def test_free_space_and_measured_points(page: LivePage, saved: MRFMap) -> None:
+    before = page.look()
+    page.select("Look", "free and unknown space")
+    page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
+    page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
+    page.until(lambda seen: "unknown: nothing" in page.text(), "the key to its colours")
+    assert page.input("Cut axis").input_value() == "z"
+    page.screenshot("free_space")
+    page.tab("Keyframes")
+    page.select("Keyframe", re.compile("^2: "))
+    page.select("Look", "measured points of the keyframe")
+    depth_m = saved.keyframes[2].depth_m
+    said = f"{(depth_m > 0).sum():,} measured points shown"
+    page.until(lambda seen: said in page.text() and "/measured" in seen.nodes, "its points")
+    assert len(page.places("/measured", "points")) == (depth_m > 0).sum()
+    assert "/voxels" not in page.look().nodes
+    page.screenshot("measured_points")
+    page.tab("Map")
+    page.select("Look", "voxels by height")
+    page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "the voxels")
+    assert "/measured" not in page.look().nodes
 
 
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
@@ -357,12 +380,36 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
 
+def test_a_link_begins_with_the_view_that_it_was_made_of(
+    page: LivePage, program: LiveProgram, browser: "Browser"
+) -> None:
+    first = page.position()
+    page.page.mouse.move(400, 600)
+    page.page.mouse.wheel(0, -300)
+    page.until(lambda seen: np.linalg.norm(np.subtract(page.position(), first)) > 0.1, "another view")
+    page.pause(1.0)
+    eye = page.position()
+    page.tab("Save")
+    page.press("Link to this view")
+    page.until(lambda seen: "now leads to this view" in page.text(), "the notification")
+    link = page.page.url
+    with LivePage(browser, program.address) as other:
+        other.page.goto("about:blank")
+        other.page.goto(link)
+        other.until_settled()
+        other.pause(1.0)
+        np.testing.assert_allclose(other.position(), eye, atol=1e-3)
+        assert other.problems == []
+    page.tab("Map")
+    page.press("Fit")
+
+
 def test_two_viewers_in_a_wide_and_a_narrow_window(
     page: LivePage, program: LiveProgram, browser: "Browser"
 ) -> None:
     before = page.look()
     with LivePage(browser, program.address, width=400, height=700) as narrow:
-        assert not narrow.input("Show").is_visible()  # the panel is folded at first
+        assert not narrow.input("Look").is_visible()  # the panel is folded at first
         narrow.until(lambda seen: seen.voxels == before.voxels, "the voxels")
         places = np.array(narrow.places("/voxels/", "points"))[:, :2]
         assert ((places > 0) & (places < (400, 700))).all()
@@ -370,7 +417,7 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         assert narrow.until_settled().voxels == before.voxels
         narrow.screenshot("narrow")
         assert narrow.page.evaluate("() => document.documentElement.scrollWidth") <= 400
-        for label in ("Threshold", "Color by", "Size"):
+        for label in ("Threshold", "Look", "Size"):
             widget = narrow.input(label)
             widget.scroll_into_view_if_needed()
             box = widget.bounding_box()

@@ -148,6 +148,16 @@ def test_a_keyframe_is_taken_out_and_comes_back(page: LivePage, edited: MRFMap) 
     assert not page.page.get_by_role("button", name="Redo", exact=True).is_visible()
 
 
+def test_several_keyframes_are_switched_off_and_taken_back_at_once(page: LivePage, edited: MRFMap) -> None:
+    before = at_rest(page)
+    page.fill("From, to", 0, 1)
+    page.press("All off")
+    page.until(lambda seen: seen.settled and seen.voxels < before.voxels, "the map without them")
+    page.screenshot("several_off")
+    page.press("Undo")
+    until_same(page, before, "the same map with them again")
+
+
 def test_a_keyframe_is_switched_off_where_it_says_that_a_voxel_is_occupied(
     page: LivePage, edited: MRFMap
 ) -> None:

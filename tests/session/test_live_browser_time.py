@@ -57,19 +57,20 @@ def red(page: LivePage) -> int:
 
 
 def said_dynamic(page: LivePage) -> int:
-    found = re.search(r"([\d,]+) dynamic", page.text())
+    found = re.search(r"([\d,]+) that move", page.text())
     return int(found[1].replace(",", "")) if found else 0
 
 
-def test_dynamic_voxels_are_red_unless_the_box_is_cleared(page: LivePage, saved: MRFMap) -> None:
+def test_what_moves_is_red_in_the_look_of_changes(page: LivePage, saved: MRFMap) -> None:
     dynamic = voxels_of(saved.dynamic)
     assert dynamic > 50
+    page.select("Look", "changes")
+    page.until(lambda seen: "/changes" in seen.nodes, "boxes around what appeared and left")
     page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
     page.screenshot("walker_dynamic")
-    page.tick("Dynamic", on=False)
+    page.select("Look", "voxels by height")
     page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == 0, "no red voxels")
-    page.tick("Dynamic")
-    page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
+    assert "/changes" not in page.look().nodes
 
 
 def test_the_list_names_what_appeared(page: LivePage) -> None:

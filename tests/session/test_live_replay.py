@@ -17,6 +17,7 @@ from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.replay import Replay
+from taichi_mrf.session.run import Progress
 
 CAMERA = PinholeCamera(width=4, height=3, fx=4.0, fy=4.0, cx=1.5, cy=1.0)
 
@@ -251,3 +252,22 @@ def test_a_camera_sets_its_own_pace_and_has_no_number_of_frames() -> None:
 def test_the_number_of_a_cameras_frames_can_be_limited() -> None:
     camera = Camera("camera", CAMERA, stamps=range(100))
     assert taken(Replay(camera, limit=5)) == ["0", "1", "2", "3", "4"]
+
+
+def test_the_time_left_follows_the_pace_of_the_last_frames() -> None:
+    now = [0.0]
+    progress = Progress(clock=lambda: now[0])
+    replay = Replay(Recording("recording", CAMERA, stamps=range(100)))
+    said = []
+    for _ in range(12):
+        said.append(progress.time_left(replay))
+        replay.take()
+        now[0] += 0.5
+    assert said[2] == ""
+    assert said[11] == ", about 45 s left"  # 89 frames, half a second each
+    replay.set_speed(1.0)
+    for _ in range(60):
+        replay.take()
+        now[0] += 10.0
+        last = progress.time_left(replay)
+    assert last == ", about 5 min left"  # what was faster counts no more

@@ -77,7 +77,7 @@ _LOOK = """() => {
     });
   }
   const paragraphs = [...document.querySelectorAll('p')];
-  const counts = paragraphs.find(p => /^[0-9,]+ (voxels|triangles) /.test(p.textContent));
+  const counts = paragraphs.find(p => /^[0-9,]+ (voxels|triangles|measured points) /.test(p.textContent));
   seen.counts = counts?.textContent ?? '';
   let panel = counts;
   while (panel && !panel.querySelector('.mantine-Progress-root')) panel = panel.parentElement;
@@ -234,7 +234,7 @@ class LivePage:
         """Wait until the map is at rest, and show its voxels."""
         self.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "a settled map")
         self.tab("Map")
-        self.select("Show", "voxels")
+        self.select("Look", "voxels by height")
         return self.until(lambda seen: seen.settled and seen.voxels, "the voxels of a settled map")
 
     def pause(self, seconds: float) -> None:

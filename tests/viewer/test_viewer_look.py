@@ -16,7 +16,6 @@ from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import (
-    OF_BELIEFS,
     ColorBy,
     ViewOptions,
     legend_html,
@@ -108,7 +107,7 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
 
 
-@pytest.mark.parametrize("color_by", [*OF_BELIEFS, "keyframes"])
+@pytest.mark.parametrize("color_by", ["probability", "height", "uncertainty", "keyframes", "changes"])
 def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
     scale = scale_of(color_by, 0.5, HEIGHTS)
     text = legend_html(scale)
@@ -127,7 +126,7 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
     large.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
-    by_marginal, by_height = ViewOptions(color_by="probability"), ViewOptions()
+    by_marginal, by_height = ViewOptions("voxels by probability"), ViewOptions()
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
     assert look_of(by_height, small, up, 0.05) != look_of(by_height, large, up, 0.05)
@@ -140,7 +139,7 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
         {"cut_axis": "x"},
         {"size": 0.5},
         {"shade": False},
-        {"color_by": "uncertainty"},
+        {"look": "voxels by uncertainty"},
     ],
     ids=str,
 )

@@ -116,6 +116,30 @@ def test_a_frozen_keyframe_cannot_be_changed(handled: LivePage) -> None:
     assert handled.asked == [m.Switch(0, on=False)]
 
 
+def test_several_keyframes_are_switched_and_taken_back_together(handled: LivePage) -> None:
+    handled.take(keyframe(2, 2.0), keyframe(3, state="off"), keyframe(4, state="frozen"), keyframe(5))
+    handled.page.panel.range.value = (1.0, 4.0)
+    handled.act("All off")
+    off = [m.Switch(1, on=False), m.Switch(2, on=False)]
+    assert handled.asked == off
+    handled.act("Undo")
+    on = [m.Switch(1, on=True), m.Switch(2, on=True)]
+    assert handled.asked == [*off, *on]
+    handled.take(keyframe(1, state="frozen"))
+    handled.act("Redo")
+    assert handled.asked[4:] == off[1:]
+    handled.act("All on")
+    assert handled.asked[5:] == [m.Switch(3, on=True)]
+
+
+def test_the_chosen_keyframe_has_a_thumbnail(handled: LivePage) -> None:
+    picture = np.full((2, 2, 3), 77, np.uint8)
+    handled.take(replace(keyframe(1), picture=picture))
+    assert handled.page.panel._thumbnail.visible
+    handled.page._choose(1)
+    np.testing.assert_array_equal(handled.page.panel._thumbnail.image, picture)
+
+
 def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> None:
     assert "Freeze" in handled.page.panel._edits.options
     handled.take(replace(HELLO, can_freeze=False))
@@ -140,10 +164,50 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
 
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
-    colors = handled.page.panel.view_options.handles["color_by"]
-    assert list(colors.options) == ["probability", "height", "uncertainty", "keyframes"]
+    looks = handled.page.panel.view_options.handles["look"]
+    assert "voxels by keyframes" in looks.options
+    assert not {"voxels in photo colours", "surface by height", "changes"} & {*looks.options}
+    assert {"free and unknown space", "measured points of the keyframe"} <= {*looks.options}
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
-    assert list(colors.options) == ["probability", "height", "uncertainty", "photo"]
+    assert "voxels by keyframes" not in looks.options
+    assert "voxels in photo colours" in looks.options
+
+
+def test_measured_points_lie_where_their_keyframe_is(handled: LivePage) -> None:
+    page = handled.page
+    page.panel.view_options.handles["look"].value = "measured points of the keyframe"
+    page._take_options()
+    assert handled.asked == [m.Watch(False, None, False, points=0)]
+    points, colors = np.array([[0, 0, 1], [0, 0, 2]], np.float32), np.zeros((2, 3), np.uint8)
+    handled.take(m.MeasuredPoints(1, points, colors))
+    assert handled.server.scene.get_handle_by_name("/measured") is None  # another one has been chosen
+    handled.take(m.MeasuredPoints(0, points, colors))
+    page._flush()
+    node = handled.server.scene.get_handle_by_name("/measured")
+    assert isinstance(node, viser.PointCloudHandle)
+    assert node.visible
+    assert page.panel._shown.content.startswith("2 measured points shown")
+    handled.take(keyframe(0, 3.0))
+    np.testing.assert_array_equal(node.position, [3.0, 0.0, 0.0])
+    page._choose(1)
+    assert handled.asked[-1] == m.Watch(False, None, False, points=1)
+    page.panel.view_options.handles["look"].value = "voxels by height"
+    page._take_options()
+    page._flush()
+    assert not node.visible
+
+
+def test_free_space_is_seen_in_a_cut_that_goes_with_the_look(handled: LivePage) -> None:
+    page, handles = handled.page, handled.page.panel.view_options.handles
+    for look, axis in (("free and unknown space", "y"), ("voxels by height", "none")):
+        handles["look"].value = look
+        page._take_options()
+        assert page.options.cut_axis == handles["cut_axis"].value == axis
+        page.options = page.panel.view_options.value()
+    handles["cut_axis"].value = "x"
+    handles["look"].value = "free and unknown space"
+    page._take_options()
+    assert page.options.cut_axis == "x"
 
 
 def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClient) -> None:

@@ -51,7 +51,6 @@ def patch(colors: np.ndarray | None = None, empty: bool = False) -> m.SurfacePat
         triangles[:0] if empty else triangles,
         np.tile(np.array([0, -127, 0], np.int8), (4, 1)),
         np.array([0.001, 0.002, 0.003, 0.010], np.float32),
-        np.full(4, 1000, np.int16),
         colors,
     )
 
@@ -138,7 +137,7 @@ def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePa
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
     vertices, triangles, _ = drawn.mesh()
     np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)
-    assert drawn.draw(show="voxels") == "512 voxels shown"
+    assert drawn.draw(look="voxels by height") == "512 voxels shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (True, False)
     drawn.take(patch(empty=True))
     assert drawn.draw() == "512 voxels shown"
@@ -179,16 +178,17 @@ def test_a_browser_begins_with_the_view_of_the_picture(drawn: SurfacePage) -> No
 def test_the_page_opens_in_the_colours_of_photographs_where_the_picture_does() -> None:
     running = SurfacePage()
     try:
-        for chosen, expected in ((None, "photo"), ("uncertainty", "uncertainty"), (None, "photo")):
-            widget = running.page.panel.view_options.handles["color_by"]
-            widget.value = chosen or ViewOptions().color_by
-            running.take(HELLO)
+        photo, other = "surface in photo colours", "voxels by uncertainty"
+        for chosen, expected in ((None, photo), (other, other), (None, photo)):
+            widget = running.page.panel.view_options.handles["look"]
+            widget.value = chosen or ViewOptions().look
+            running.take(replace(HELLO, has_colors=True))
             running.take(replace(VIEW, photo=True))
             assert widget.value == expected
-        widget.value = "height"
+        widget.value = "surface by height"
         running.take(replace(VIEW, photo=True))
-        assert widget.value == "height"  # a user has chosen it
-        running.page.options = ViewOptions(color_by="photo")
+        assert widget.value == "surface by height"  # a user has chosen it
+        running.page.options = ViewOptions(photo)
         assert not running.page._extras(running.page.options)[2]  # the patches have colours of their own
     finally:
         running.server.stop()
@@ -199,8 +199,9 @@ def test_a_map_without_a_surface_offers_none() -> None:
     try:
         running.asked.clear()
         running.take(replace(HELLO, method="log_odds", has_surface=False))
-        assert running.page.panel.view_options.handles["show"].options == ("voxels",)
-        assert running.page.options.show == "voxels"
+        looks = running.page.panel.view_options.handles["look"].options
+        assert not any("surface" in look for look in looks)
+        assert running.page.options.look == looks[0] == "voxels by height"
         assert running.asked == []
     finally:
         running.server.stop()
@@ -211,24 +212,22 @@ def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
                         np.ones((1, 512), np.uint8), np.zeros((0, 3), np.int32)))  # fmt: skip
     drawn.take(patch())
     drawn.take(VIEW)
-    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=9.0)
-    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at_m=3.85)
+    assert "2 triangles" in drawn.draw(cut_axis="x", cut_at_m=9.0)
+    assert "1 triangles" in drawn.draw(cut_axis="x", cut_at_m=3.85)
 
 
 def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     photo = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [90, 90, 90]], np.uint8)
     drawn.take(patch(photo))
     drawn.take(VIEW)
-    drawn.draw(color_by="photo", shade=False)
+    drawn.draw(look="surface in photo colours", shade=False)
     assert np.abs(drawn.mesh()[2].astype(int) - photo).max() <= 1
-    drawn.draw(show="surface", color_by="uncertainty", shade=False)
+    drawn.draw(look="surface by uncertainty", shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
     assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
     expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
-    drawn.draw(show="surface", color_by="probability", shade=False)
-    assert len(np.unique(drawn.mesh()[2], axis=0)) == 1  # they are equally likely
     drawn.draw(shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
@@ -242,7 +241,7 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
 def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> None:
     drawn.take(patch())
     drawn.take(VIEW)
-    drawn.draw(show="surface")
+    drawn.draw()
     drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0), (0.0, 0.0)))
     asked = drawn.asked[-1]
     assert isinstance(asked, m.RayThrough)

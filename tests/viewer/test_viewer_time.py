@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
@@ -89,16 +90,27 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     running.take(m.Bricks("map", brick, occupied, seen, NOTHING))
     assert (len(colors(running)), red(running)) == (40, 0)
     running.take(m.Bricks("dynamic", brick, dynamic, seen, NOTHING))
+    assert (len(colors(running)), red(running)) == (40, 0)
+    running.page.options = ViewOptions("changes")
+    running.page.map.look_changed()
     assert (len(colors(running)), red(running)) == (40, 7)
     running.page.show_counts()
     shown = running.page.panel._shown.content
-    assert shown == "40 voxels shown, 7 dynamic · ground in squares of 0.1 m"
-    running.page.options = replace(ViewOptions(), dynamic=False)
-    running.page.map.look_changed()
-    assert (len(colors(running)), red(running)) == (40, 0)
+    assert shown == "40 voxels shown, 7 that move · ground in squares of 0.1 m"
+    chair = m.SceneChange(START_S, "left", (0.5, 0.6, 0.7), (1.0, 2.0, 0.4))
+    running.take(m.SceneChanges((chair,)))
+    assert red(running) == 7
+    box = running.server.scene.get_handle_by_name("/changes")
+    assert isinstance(box, viser.LineSegmentsHandle)
+    np.testing.assert_allclose(box.points.reshape(-1, 3).min(axis=0), [0.75, 1.7, 0.05], atol=1e-6)
+    np.testing.assert_allclose(box.points.reshape(-1, 3).max(axis=0), [1.25, 2.3, 0.75], atol=1e-6)
+    assert "left" in running.page.panel._legend.content
     running.page.options = ViewOptions()
     running.page.map.look_changed()
-    assert red(running) == 7
+    assert red(running) == 0
+    assert running.server.scene.get_handle_by_name("/changes") is None
+    running.page.options = ViewOptions("changes")
+    running.page.map.look_changed()
     running.take(m.Bricks("dynamic", brick[:0], dynamic[:0], seen[:0], brick))
     assert (len(colors(running)), red(running)) == (40, 0)
 

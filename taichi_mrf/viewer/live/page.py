@@ -26,11 +26,12 @@ from taichi_mrf.viewer.live.panel import (
     facts_of_many,
 )
 from taichi_mrf.viewer.scene.base_page import BasePage
-from taichi_mrf.viewer.scene.base_panel import Inbox
+from taichi_mrf.viewer.scene.base_panel import POP_UP_S, Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import change, in_markdown
+from taichi_mrf.viewer.transport.pulse import LINK
 
 Edit = m.Switch | m.Move
 """Edits of a keyframe that can be taken back."""
@@ -38,7 +39,7 @@ Edit = m.Switch | m.Move
 MOST_ASKED = 32
 """Of as many voxels in a rectangle keyframes are asked at most."""
 
-_PLAIN = ViewOptions(show="voxels")
+_PLAIN = ViewOptions("voxels by height")
 """Options that the mapping process serves unless it is asked for more."""
 
 
@@ -54,8 +55,9 @@ class Page(BasePage[Panel]):
         self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
-        self._edits: list[tuple[Edit, Edit]] = []
-        """Edits that can be taken back and made again: what undoes each, and itself."""
+        self._edits: list[list[tuple[Edit, Edit]]] = []
+        """Edits that can be taken back and made again, those of one press together: what undoes each, and
+        itself."""
         self._done = 0  # how many of them are made
         self.handlers |= {
             m.Hello: self._begin,
@@ -71,7 +73,8 @@ class Page(BasePage[Panel]):
             m.Votes: self._show_votes,
             m.Images: self.panel.show_images,
             m.TimeSpan: self.panel.time.show_span,
-            m.SceneChanges: self.panel.time.show_changes,
+            m.SceneChanges: self._take_changes,
+            m.MeasuredPoints: self._take_points,
             Clicked: self._clicked,
             Framed: self._framed,
             Dragged: self._dragged,
@@ -91,6 +94,8 @@ class Page(BasePage[Panel]):
             "Leave it as it is": self.panel.close_question,
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
             "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
+            "All off": lambda client: self._switch_range(False),
+            "All on": lambda client: self._switch_range(True),
             "Freeze": self._freeze,
             "Freeze it": self.panel.agree,
             "Move": lambda client: self._toggle_gizmo(),
@@ -104,6 +109,7 @@ class Page(BasePage[Panel]):
             "Voxels (.ply)": lambda client: ask(m.Save("ply", client)),
             "Mesh (.ply)": lambda client: ask(m.Save("mesh", client)),
             "Picture (.png)": self.downloads.picture,
+            LINK: self._tell_of_link,
             "Page (.html)": self.downloads.page,
             "Recording (.viser)": self._record,
             "Close": lambda client: self.answer.clear(),
@@ -164,7 +170,7 @@ class Page(BasePage[Panel]):
             self.viewpoint.look_as_pictured(view)
         if view.photo and not self._in_photo:
             self._in_photo = True
-            self.panel.color_by_photo()
+            self.panel.show_in_photo_colors()
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if keyframe.state == "frozen":
@@ -172,11 +178,28 @@ class Page(BasePage[Panel]):
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
+            if self.options.shows == "points":
+                self._ask_for_extras()
         if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
             change(self.panel.unsaved, visible=True)
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
+        if self.map is not None:
+            self.map.move_measured(keyframe.id, keyframe.T_world_camera)
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)
+
+    def _take_changes(self, changes: m.SceneChanges) -> None:
+        self.panel.time.show_changes(changes)
+        if self.map is not None:
+            self.map.changes = changes.changes
+            self.map.look_changed()
+
+    def _take_points(self, measured: m.MeasuredPoints) -> None:
+        """Show what a keyframe measured, unless another one has been chosen meanwhile."""
+        if self.map is not None and measured.keyframe == self.keyframes.chosen:
+            T_world_camera = self.keyframes.keyframes[measured.keyframe].T_world_camera
+            self.map.show_measured(measured, T_world_camera)
+            self.map.look_changed()
 
     def _take_file(self, file: m.File) -> None:
         self.downloads.send(file.client, file.name, file.content)
@@ -228,6 +251,13 @@ class Page(BasePage[Panel]):
         self.downloads.toggle_recording(client)
         self.show_counts()
 
+    def _tell_of_link(self, client: int) -> None:
+        """Say what the page's script has done in the client's browser."""
+        handle = self.server.get_clients().get(client)
+        if handle is not None:
+            text = "The address of this page now leads to this view. It is copied if the browser allows that."
+            handle.add_notification("Link", text, auto_close_seconds=POP_UP_S)
+
     def _edit(self, request_for: Callable[[m.KeyframeInfo], m.Request]) -> None:
         """Send a request about the chosen keyframe, unless it is frozen or there is none."""
         chosen = self._changeable()
@@ -235,17 +265,28 @@ class Page(BasePage[Panel]):
             request = request_for(chosen)
             self._make(request) if isinstance(request, Edit) else self.ask(request)
 
-    def _make(self, edit: Edit) -> None:
-        """Send an edit that can be taken back."""
-        before = self.keyframes.keyframes[edit.keyframe]
-        if isinstance(edit, m.Switch):
-            back: Edit = m.Switch(edit.keyframe, before.state == "on")
-        else:
-            back = m.Move(edit.keyframe, before.T_world_camera)
-        self._edits[self._done :] = [(back, edit)]
-        self._done += 1
-        self._show_history()
-        self.ask(edit)
+    def _make(self, *edits: Edit) -> None:
+        """Send edits that can be taken back together."""
+        pairs: list[tuple[Edit, Edit]] = []
+        for edit in edits:
+            before = self.keyframes.keyframes[edit.keyframe]
+            if isinstance(edit, m.Switch):
+                pairs.append((m.Switch(edit.keyframe, before.state == "on"), edit))
+            else:
+                pairs.append((m.Move(edit.keyframe, before.T_world_camera), edit))
+        if pairs:
+            self._edits[self._done :] = [pairs]
+            self._done += 1
+            self._show_history()
+        for edit in edits:
+            self.ask(edit)
+
+    def _switch_range(self, on: bool) -> None:
+        """Switch all keyframes from one number to another on or off."""
+        first, last = self.panel.range.value
+        state = "off" if on else "on"
+        known = sorted(self.keyframes.keyframes.items())
+        self._make(*(m.Switch(id, on) for id, each in known if first <= id <= last and each.state == state))
 
     def _redo(self, back: bool = False) -> None:
         """Make the next edit again, or take the last one ``back``."""
@@ -253,13 +294,14 @@ class Page(BasePage[Panel]):
         if 0 <= place < len(self._edits):
             self._done = place + (not back)
             self._show_history()
-            self.ask(self._edits[place][0 if back else 1])
+            for pair in self._edits[place]:
+                self.ask(pair[0 if back else 1])
 
     def _forget_edits(self, keyframes: Collection[int]) -> None:
         """Edits of these keyframes can no longer be taken back."""
-        kept = [edit[1].keyframe not in keyframes for edit in self._edits]
-        self._done = sum(kept[: self._done])
-        self._edits = [edit for edit, keep in zip(self._edits, kept, strict=True) if keep]
+        left = [[pair for pair in pairs if pair[1].keyframe not in keyframes] for pairs in self._edits]
+        self._done = sum(map(bool, left[: self._done]))
+        self._edits = [pairs for pairs in left if pairs]
         self._show_history()
 
     def _show_history(self) -> None:
@@ -308,7 +350,8 @@ class Page(BasePage[Panel]):
         self.keyframes.release()
         self.keyframes.choose(keyframe)
         self.panel.show_keyframes(self.keyframes.keyframes, keyframe)
-        if self.panel.images.value and self.panel.view.value == CHOSEN_KEYFRAME:
+        watched = self.panel.images.value and self.panel.view.value == CHOSEN_KEYFRAME
+        if watched or self.options.shows == "points":
             self._ask_for_extras()
 
     def _watch_images(self) -> None:
@@ -377,12 +420,13 @@ class Page(BasePage[Panel]):
             self._make(m.Switch(listed[0], False))
             self.ask(self._question)
 
-    def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
-        """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
-        of voxels, and the measured surface, which has colours of its own."""
-        by, surface = options.color_by, options.show == "surface"
-        instead = surface and self.map is not None and not self.map.growing
-        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface
+    def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool, int | None]:
+        """What the options need: the baseline's map, the counts of keyframes, the colours of voxels, the
+        measured surface, which has colours of its own, and the keyframe whose points are shown."""
+        by, surface = options.color_by, options.shows == "surface"
+        instead = options.shows == "points" or (surface and self.map is not None and not self.map.growing)
+        points = self.keyframes.chosen if options.shows == "points" else None
+        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface, points
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:

@@ -4,7 +4,7 @@ click on a voxel in a panel beside it. The page decides what they do.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import viser
@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import OF_BELIEFS, ColorBy, Show, ViewOptions, dynamic_legend_html
+from taichi_mrf.viewer.scene.coloring import LOOKS, LookName, ViewOptions
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
+from taichi_mrf.viewer.transport.pulse import LINK
 
 Point = tuple[float, float, float]
 Vote = tuple[m.KeyframeInfo, float]
@@ -73,6 +74,7 @@ SAVE_BUTTONS = {
     "Voxels (.ply)": "The voxels with probability 0.5 or more, for MeshLab, CloudCompare or Blender.",
     "Mesh (.ply)": "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it.",
     "Picture (.png)": "What this browser shows.",
+    LINK: "Put what this browser looks at into the page's address, and copy that.",
     "Page (.html)": "The scene in one file that any browser opens, without a server.",
     "Recording (.viser)": "Start recording the scene; press again to get the file.",
 }
@@ -82,8 +84,7 @@ NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
-    "show", "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks",
-    "show_baseline",
+    "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "show_baseline",
 )  # fmt: skip
 TIME_STEP_S = 0.1
 
@@ -94,10 +95,12 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
+        self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
         self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
+        self.view_options.add("look")
         self.add_legend()
         self.add_counts()
         self.add_buttons(
@@ -113,8 +116,6 @@ class Panel(BasePanel):
         self._history: Any = self.add_buttons("Edits", HISTORY_BUTTONS, hint)
         self.show_history(False, False)
         self.time = TimeFolder(gui, self)
-        with self.time.folder:
-            self.view_options.add("dynamic")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self.view_options.add(*_MAP_OPTIONS)
@@ -141,8 +142,7 @@ class Panel(BasePanel):
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
-        self.view_options.offer("color_by", _colors_of(hello))
-        self.view_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
+        self.view_options.offer("look", _looks_of(hello))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -168,11 +168,11 @@ class Panel(BasePanel):
         box = self.view_options.handles["follow"]
         box.value = (not box.value) if on is None else on
 
-    def color_by_photo(self) -> None:
-        """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
-        widget = self.view_options.handles["color_by"]
-        if widget.value == ViewOptions().color_by:
-            widget.value = "photo"
+    def show_in_photo_colors(self) -> None:
+        """Show the colours that cameras saw, unless a user has chosen another look than the first one."""
+        widget = self.view_options.handles["look"]
+        if widget.value == ViewOptions().look:
+            widget.value = "surface in photo colours"
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
@@ -214,10 +214,13 @@ class Panel(BasePanel):
         for widget in (self.position, self.pixel, self._pixel_button):
             change(widget, disabled=fixed)
         change(self._edits, visible=not fixed)  # viser cannot disable a row of buttons
+        change(self._thumbnail, visible=chosen is not None)
         if chosen is None:
             self._keyframe_text.content = ""
             return
         info = keyframes[chosen]
+        if info.picture is not self._thumbnail_of:
+            self._thumbnail_of = self._thumbnail.image = info.picture
         self.position.value = tuple(np.round(info.T_world_camera[:3, 3], 4).tolist())
         text = f"{info.rays:,} measured pixels"
         self._keyframe_text.content = in_markdown(f"{text}; frozen: it cannot be changed" if fixed else text)
@@ -270,6 +273,11 @@ class Panel(BasePanel):
             gui.add_vector3("Position (m)", (0.0, 0.0, 0.0), step=POSITION_STEP_M, hint=hint)
         )
         self._keyframe_text = gui.add_markdown("")
+        self._thumbnail = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
+        hint = "Numbers of the first and the last keyframe that the buttons below switch."
+        self.range: Any = gui.add_vector2("From, to", (0.0, 0.0), min=(0.0, 0.0), step=1.0, hint=hint)
+        hint = "Remove all these keyframes from the map, or add them again; Undo takes that back at once."
+        self.add_buttons("Several", ("All off", "All on"), hint)
         gui.add_markdown(
             "**On/off** removes the keyframe from the map, or adds it again. **Freeze** asks, and then makes "
             "its evidence permanent and drops its image. **Move** shows a gizmo: drag it, and the map "
@@ -299,14 +307,18 @@ class Panel(BasePanel):
         self._pictures = {n: gui.add_image(black, label=label, visible=False) for n, label in labels.items()}
 
 
-def _colors_of(hello: m.Hello) -> tuple[ColorBy, ...]:
-    """Choices of what the colour shows of a map."""
-    found = list(OF_BELIEFS)
-    if hello.counts_keyframes:
-        found.append("keyframes")
-    if hello.has_colors:
-        found.append("photo")
-    return tuple(found)
+def _looks_of(hello: m.Hello) -> tuple[LookName, ...]:
+    """The looks that a map has the data for."""
+    lacking: set[str] = set()
+    lacking |= set() if hello.has_surface else {"surface"}
+    lacking |= set() if hello.counts_keyframes else {"keyframes"}
+    lacking |= set() if hello.has_dates else {"changes"}
+    photo = hello.has_colors
+    return tuple(
+        look
+        for look, (shows, by) in LOOKS.items()
+        if not {shows, by} & lacking and (photo or by != "photo" or shows == "points")
+    )
 
 
 class TimeFolder:
@@ -326,7 +338,6 @@ class TimeFolder:
                 gui.add_slider("Time (s)", least, most, TIME_STEP_S, now, disabled=True, hint=hint)
             )
             self._list = gui.add_html("", visible=False)
-            gui.add_html(dynamic_legend_html())
 
     def begin(self, has_dates: bool) -> None:
         """Start with an empty map; the folder is there if it ``has_dates``."""

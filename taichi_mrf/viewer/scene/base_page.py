@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used, pop_up
-from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions, legend_html
+from taichi_mrf.viewer.scene.coloring import SPACE, Scale, ViewOptions, key_html, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
@@ -57,7 +57,7 @@ class BasePage(Generic[P]):
         self.keyframes = KeyframeLayer(server.scene)
         self.viewpoint = ViewpointController(server)
         self.map: MapScene | None = None
-        self._scale: Scale | None = None
+        self._explained: tuple[Scale | None, ViewOptions] | None = None  # by the legend
         self._with_baseline = False
         self.actions: dict[str, Callable[[int], None]] = {BasePanel.DARK_OR_LIGHT[0]: self._turn_colors}
         """Function of each action, given the client that asked for it."""
@@ -121,6 +121,8 @@ class BasePage(Generic[P]):
         before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
+        if self.options.look != before.look and SPACE in (self.options.look, before.look):
+            self._cut_for_space(self.options)
         if self.options.cut_axis != before.cut_axis:
             self._offer_cuts(in_middle=True)
             self.options = self.panel.view_options.value()
@@ -128,6 +130,16 @@ class BasePage(Generic[P]):
         self.keyframes.show_pictures(self.options.pictures)
         if self.map is not None:
             self.map.look_changed()
+
+    def _cut_for_space(self, options: ViewOptions) -> None:
+        """Free space is seen in a cut only: make a level one for it, unless there is a cut, and leave it with
+        the look."""
+        axis = self.panel.view_options.handles["cut_axis"]
+        if options.look != SPACE:
+            axis.value = "none"
+        elif options.cut_axis == "none":
+            axis.value = "xyz"[self.viewpoint.up[0]]
+        self.options = self.panel.view_options.value()
 
     def _turn_colors(self, client: int) -> None:
         """The page's script takes dark colours as its user's wish for the others than now."""
@@ -157,9 +169,10 @@ class BasePage(Generic[P]):
         box = self.map.box_m()
         if box is not None:
             self.viewpoint.map_grew(*box)
-        if self.map.scale is not None and self.map.scale != self._scale:
-            self._scale = self.map.scale
-            self.panel.show_legend(legend_html(self._scale))
+        shown = self.map.scale, self.options
+        if self.map.scale is not None and shown != self._explained:
+            self._explained = shown
+            self.panel.show_legend(legend_html(self.map.scale) + key_html(self.options))
 
 
 def _backdrop() -> NDArray[np.uint8]:

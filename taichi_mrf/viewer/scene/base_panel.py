@@ -68,10 +68,13 @@ Tell = Callable[[Event], None]
 _MOST_NOTICES = 8
 
 _COUNTED = {
-    "dynamic": "dynamic",
+    "dynamic": "that move",
     "baseline": "of the baseline",
 }
 """Layers that are counted beside voxels or the surface, and their words."""
+
+_INSTEAD = {"triangles": "triangles of the measured surface", "points": "measured points"}
+"""Layers that are shown in the place of voxels, and their words."""
 
 _SEVERITY_COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
 _POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
@@ -79,7 +82,7 @@ _POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
     "warning": "yellow",
     "error": "red",
 }
-_POP_UP_S = 8.0
+POP_UP_S = 8.0
 _LONGEST_POP_UP = 500
 
 
@@ -140,8 +143,9 @@ class BasePanel:
     def show_counts(self, counts: Mapping[str, int], square_m: float | None, recording: bool) -> None:
         """Show how much the page shows, by the names that MapScene.counts has, how wide the squares on the
         ground are if there are any, and whether the scene is being recorded."""
-        surface = counts["triangles"]
-        what = f"{surface:,} triangles of the measured surface" if surface else f"{counts['map']:,} voxels"
+        what = f"{counts['map']:,} voxels"
+        for name, words in _INSTEAD.items():
+            what = f"{counts[name]:,} {words}" if name in counts else what
         text = f"{what} shown"
         text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
         text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
@@ -207,4 +211,4 @@ def pop_up(server: viser.ViserServer, notice: Notice) -> None:
     color = _POP_UP_COLORS[notice.severity]
     text = notice.text[:_LONGEST_POP_UP]
     for client in server.get_clients().values():
-        client.add_notification(title, text, auto_close_seconds=_POP_UP_S, color=color)
+        client.add_notification(title, text, auto_close_seconds=POP_UP_S, color=color)

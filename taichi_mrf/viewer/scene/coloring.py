@@ -18,10 +18,43 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
-ColorBy = Literal["probability", "height", "uncertainty", "keyframes", "photo"]
-OF_BELIEFS: tuple[ColorBy, ...] = ("probability", "height", "uncertainty")
-"""Choices of what the colour shows of every map."""
-Show = Literal["surface", "voxels"]
+ColorBy = Literal["probability", "height", "uncertainty", "keyframes", "photo", "changes"]
+Show = Literal["surface", "voxels", "points"]
+LookName = Literal[
+    "surface by height",
+    "surface in photo colours",
+    "surface by uncertainty",
+    "voxels by height",
+    "voxels in photo colours",
+    "voxels by probability",
+    "voxels by uncertainty",
+    "voxels by keyframes",
+    "free and unknown space",
+    "measured points of the keyframe",
+    "changes",
+]
+LOOKS: dict[LookName, tuple[Show, ColorBy]] = {
+    "surface by height": ("surface", "height"),
+    "surface in photo colours": ("surface", "photo"),
+    "surface by uncertainty": ("surface", "uncertainty"),
+    "voxels by height": ("voxels", "height"),
+    "voxels in photo colours": ("voxels", "photo"),
+    "voxels by probability": ("voxels", "probability"),
+    "voxels by uncertainty": ("voxels", "uncertainty"),
+    "voxels by keyframes": ("voxels", "keyframes"),
+    "free and unknown space": ("voxels", "height"),
+    "measured points of the keyframe": ("points", "photo"),
+    "changes": ("voxels", "changes"),
+}
+"""What each look shows, and the meaning of its colour."""
+SPACE: LookName = "free and unknown space"
+OF_BELIEFS: tuple[LookName, ...] = (
+    "voxels by height",
+    "voxels by probability",
+    "voxels by uncertainty",
+    SPACE,
+)
+"""Looks that every map can have."""
 CutAxis = Literal["none", "x", "y", "z"]
 
 
@@ -29,14 +62,11 @@ CutAxis = Literal["none", "x", "y", "z"]
 class ViewOptions:
     """How the map is shown; nothing here changes the map."""
 
-    show: Show = "surface"
-    """Show the surface that the keyframes measured, below the size of voxels, or the voxels of the map. The
-    surface is made when no frames are read, at the end or while paused; until then voxels are shown."""
-
-    color_by: ColorBy = "height"
-    """Meaning of the colour: the probability, the height, the uncertainty (of a voxel its entropy, of the
-    surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
-    cameras saw (photo)."""
+    look: LookName = "surface by height"
+    """Show the surface that the keyframes measured, which is finer than voxels; the voxels of the map; the
+    space that is known to be free, in a cut; the points that the chosen keyframe measured; or what moves, in
+    red, with boxes around what appeared and left. The surface is made when no frames are read, at the end or
+    while paused; until then voxels are shown in its place."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5
     """Show voxels whose probability of being occupied is at least this."""
@@ -75,8 +105,15 @@ class ViewOptions:
     show_baseline: bool = False
     """Also map the same keyframes with OctoMap's log-odds update, and show that map next to this one."""
 
-    dynamic: bool = True
-    """Show in red what is dynamic: occupied now, although all keyframes together say that it is free."""
+    @property
+    def shows(self) -> Show:
+        """What the look shows."""
+        return LOOKS[self.look][0]
+
+    @property
+    def color_by(self) -> ColorBy:
+        """Meaning of the look's colour."""
+        return LOOKS[self.look][1]
 
 
 _MAPS: dict[ColorBy, str] = {
@@ -85,12 +122,19 @@ _MAPS: dict[ColorBy, str] = {
     "uncertainty": "magma",
     "keyframes": "plasma",
     "photo": "bone",  # of no voxel
+    "changes": "gray",
 }
 
 PHOTO_LABEL = "what cameras saw; grey where none did"
 
 DYNAMIC_COLOR = (255, 30, 20)
 """The colour of dynamic voxels, which no scale has."""
+
+CHANGE_COLORS = {"appeared": (40, 200, 90), "left": (255, 170, 30)}
+"""Colours of the boxes around what appeared and what left."""
+
+SPACE_COLORS = {"free": (70, 130, 200), "occupied": (253, 200, 36)}
+"""Colours in a cut."""
 
 _DARKENED = (0.75, 0.62, 1.0)
 """Brightness of surfaces perpendicular to x, y and z."""
@@ -130,7 +174,7 @@ def scale_of(
     largest number of keyframes that see a voxel. Marginals begin at one half, or at 0 if less probable voxels
     are shown; counts of keyframes are on a logarithmic scale that ends at a power of two."""
     colors = _colors(color_by)
-    if color_by == "height":
+    if color_by in ("height", "changes"):
         return Scale(color_by, colors, *heights_m, "height (m)")
     if color_by == "keyframes":
         doublings = max(2, int(np.ceil(np.log2(max(most_keyframes, 1)))))
@@ -151,7 +195,9 @@ def _colors(color_by: ColorBy) -> NDArray[np.uint8]:
     """The 256 colours (256, 3) of a mode, RGB."""
     from matplotlib import colormaps
 
-    found: NDArray[np.uint8] = colormaps[_MAPS[color_by]](np.arange(256), bytes=True)[:, :3]
+    ends = (90, 190) if color_by == "changes" else (0, 255)  # grey that lets other colours stand out
+    steps = np.linspace(*ends, 256).astype(int)
+    found: NDArray[np.uint8] = colormaps[_MAPS[color_by]](steps, bytes=True)[:, :3]
     return np.ascontiguousarray(found)
 
 
@@ -207,14 +253,17 @@ def legend_html(scale: Scale) -> str:
     )
 
 
-def dynamic_legend_html() -> str:
-    """Legend of the colour of dynamic voxels, for the page."""
-    red, green, blue = DYNAMIC_COLOR
-    return (
-        '<div style="padding:0 0.75em;font-size:0.85em"><span style="display:inline-block;width:0.8em;'
-        f'height:0.8em;background:rgb({red},{green},{blue});margin-right:0.4em"></span>'
-        "dynamic: occupied now, usually free</div>"
+def key_html(options: ViewOptions) -> str:
+    """Key to the colours that are not on the scale, for the page: those of a cut, and of changes."""
+    named = dict(SPACE_COLORS) if options.cut_axis != "none" else {}
+    if options.color_by == "changes":
+        named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
+    swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
+    spans = "".join(
+        f'<span style="{swatch};background:rgb{color}"></span>{name}' for name, color in named.items()
     )
+    unknown = " · unknown: nothing" if options.cut_axis != "none" else ""
+    return f'<div style="font-size:0.85em">{spans}{unknown}</div>' if named else ""
 
 
 def _numbers(share: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -5,15 +5,18 @@ Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times a secon
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
-from taichi_mrf.viewer.scene.coloring import Scale, ViewOptions
+from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer, MeasuredPoints, SceneChange
+from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, Scale, Show, ViewOptions
+from taichi_mrf.viewer.scene.keyframe_layer import placement
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
@@ -27,6 +30,9 @@ REST_S = 0.5
 _GAP_M = 0.5
 """Distance between the map and the baseline's map, in metres."""
 
+_POINTS_LABEL = "what the chosen keyframe measured, in the colours of its photo, or of depth"
+_POINT_SHARE = 0.25
+"""Size of a measured point, in voxels."""
 
 _LOWEST_SHARE = 0.02
 """Share of the voxels that may lie below the ground: those that noise has put there."""
@@ -40,7 +46,8 @@ _GROUND_COLOR = (160, 165, 172)
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /surface, /baseline, /cut, /bricks, /ground and /names."""
+    """Owns the scene nodes /voxels, /surface, /measured, /changes, /baseline, /cut, /bricks, /ground and
+    /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -50,7 +57,11 @@ class MapScene:
         }
         self.surface = SurfaceLayer(server.scene, "/surface", hello.voxel_size)
         self._voxels = server.scene.add_frame("/voxels", show_axes=False)
-        self._surface_wanted = False
+        self._shows: Show = "voxels"
+        self._measured: MeasuredPoints | None = None
+        self._points: viser.PointCloudHandle | None = None
+        self.changes: tuple[SceneChange, ...] = ()
+        """What has appeared and left lately."""
         self.growing = False
         """True while frames are read: a surface that was made before lacks what they add."""
         self.ground = Ground(server.scene)
@@ -68,12 +79,14 @@ class MapScene:
         """The colour scale in use; None before anything was drawn."""
         if self._look is None:
             return None
+        if self._shows == "points":
+            return replace(self._look.scale, label=_POINTS_LABEL)
         return self.surface.scale(self._look) if self.shows_surface else self._look.scale
 
     @property
     def shows_surface(self) -> bool:
         """True if the measured surface is shown in the place of voxels: not while the map grows."""
-        return self._surface_wanted and self.surface.is_complete and not self.growing
+        return self._shows == "surface" and self.surface.is_complete and not self.growing
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
@@ -87,9 +100,12 @@ class MapScene:
     def counts(self) -> dict[str, int]:
         """How many of what is shown, or will be once everything has been sent, by name."""
         counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
-        counts |= {"dynamic": self.layers["map"].dynamic_shown, "triangles": 0}
+        counts |= {"dynamic": self.layers["map"].dynamic_shown}
         if self.shows_surface:
             counts |= {"map": 0, "dynamic": 0, "triangles": self.surface.triangles_shown}
+        if self._shows == "points":
+            points = 0 if self._measured is None else len(self._measured.points_m)
+            counts |= {"map": 0, "dynamic": 0, "points": points}
         return counts
 
     def points(self) -> NDArray[np.float64]:
@@ -110,6 +126,24 @@ class MapScene:
         self.layers["map"].changed |= self.store.put(colors.bricks, colors=colors.colors)
         self._news_at = time.monotonic()
 
+    def show_measured(self, measured: MeasuredPoints, T_world_camera: Pose) -> None:
+        """Show what a keyframe measured, at its pose; :meth:`flush` hides it unless that is the look."""
+        self._measured = measured
+        self._points = self._server.scene.add_point_cloud(
+            "/measured",
+            points=measured.points_m,
+            colors=measured.colors,
+            point_size=_POINT_SHARE * self._hello.voxel_size,
+            point_shape="circle",
+            visible=self._shows == "points",
+        )
+        self.move_measured(measured.keyframe, T_world_camera)
+
+    def move_measured(self, keyframe: int, T_world_camera: Pose) -> None:
+        """Move the measured points with their keyframe."""
+        if self._points is not None and self._measured is not None and self._measured.keyframe == keyframe:
+            self._points.wxyz, self._points.position = placement(T_world_camera)
+
     def look_changed(self) -> None:
         """Draw everything again at the next :meth:`flush`, without waiting for its turn."""
         self._all_dirty = True
@@ -121,7 +155,8 @@ class MapScene:
             layer.clear()
         self.surface.clear()
         self.ground.hide()
-        for name in ("/cut", "/bricks", *(f"/names/{layer}" for layer in _NAMES)):
+        self._measured = self._points = None
+        for name in ("/measured", "/changes", "/cut", "/bricks", *(f"/names/{layer}" for layer in _NAMES)):
             self._server.scene.remove_by_name(name)
 
     def patience(self) -> float | None:
@@ -156,7 +191,7 @@ class MapScene:
         look = look_of(options, self.store, up, self._hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
-        self._surface_wanted = options.show == "surface"
+        self._shows = options.shows
         map_changed = everything or bool(self.layers["map"].changed)
         any_changed = map_changed or bool(self.layers["baseline"].changed)
         for layer in self.layers.values():
@@ -164,15 +199,16 @@ class MapScene:
         if everything:
             self.surface.outdate()
         if self.shows_surface:
-            self.surface.prepare(look, self.store)
+            self.surface.prepare(look)
         announce()
         with self._server.atomic():
             for layer in self.layers.values():
                 layer.send()
-            self._show_surface(self.shows_surface)
+            self._show_one(self.shows_surface)
             if map_changed:
                 self._draw_cut(look, crossed)
                 self._draw_bricks(options.bricks)
+                self._draw_changes(options.color_by == "changes")
                 self._show_space(options, up)
             if any_changed:
                 self.layers["baseline"].place(self._baseline_m(up))
@@ -180,10 +216,30 @@ class MapScene:
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
 
-    def _show_surface(self, visible: bool) -> None:
-        """Show the surface in the place of voxels, or these."""
-        self.surface.send(visible)
-        change(self._voxels, visible=not visible)
+    def _show_one(self, surface: bool) -> None:
+        """Show the surface in the place of voxels, or a keyframe's points, or voxels."""
+        points = self._shows == "points"
+        self.surface.send(surface)
+        change(self._voxels, visible=not (surface or points))
+        if self._points is not None:
+            change(self._points, visible=points)
+
+    def _draw_changes(self, wanted: bool) -> None:
+        """Draw boxes around what has appeared and left if they are ``wanted``."""
+        scene = self._server.scene
+        if not wanted or not self.changes:
+            scene.remove_by_name("/changes")
+            return
+        edges = brick_edges(np.zeros((1, 3), np.int64)) - 0.5
+        lines = [np.array(each.centre_m) + edges * each.size_m for each in self.changes]
+        colors = np.repeat([CHANGE_COLORS[each.verb] for each in self.changes], len(edges), axis=0)
+        scene.add_line_segments(
+            "/changes",
+            np.concatenate(lines).astype(np.float32),
+            np.repeat(colors[:, None], 2, axis=1).astype(np.uint8),
+            thickness=2.0,
+            thickness_units="screen",
+        )
 
     def _show_space(self, options: ViewOptions, up: Up) -> None:
         """Show the axes, and the ground under the map while that has the same box."""

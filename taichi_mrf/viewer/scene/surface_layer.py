@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.viewer.messages import SurfacePatch, SurfaceView
 from taichi_mrf.viewer.scene.coloring import Scale, height_scale, std_colors, std_scale, voxel_colors
 from taichi_mrf.viewer.scene.voxel_layer import Look
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown
 from taichi_mrf.viewer.scene.widgets import change
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -95,7 +95,7 @@ class SurfaceLayer:
         every = [np.zeros(0, np.float32), *(patch.std_m for patch in self.patches.values())]
         return std_scale(np.concatenate(every))
 
-    def prepare(self, look: Look, store: VoxelStore) -> None:
+    def prepare(self, look: Look) -> None:
         """Make the meshes of the patches that have changed; :meth:`send` sends them."""
         scale = self.scale(look)
         if scale != self._scale:  # that of uncertainty and that of heights depend on all patches
@@ -103,7 +103,7 @@ class SurfaceLayer:
             self.outdate()
         for key in sorted(self._stale):
             patch = self.patches.get(key)
-            self._prepared[key] = None if patch is None else self._drawn(patch, look, scale, store)
+            self._prepared[key] = None if patch is None else self._drawn(patch, look, scale)
         self._stale.clear()
 
     def send(self, visible: bool) -> None:
@@ -138,12 +138,12 @@ class SurfaceLayer:
         ]
         return np.concatenate([np.zeros((0, 3)), *shown])
 
-    def _drawn(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> _Mesh | None:
+    def _drawn(self, patch: SurfacePatch, look: Look, scale: Scale) -> _Mesh | None:
         triangles = self._uncut(patch, look.cut)
         if not len(triangles):
             return None
         vertices = (patch.vertices_m - self._corner_m(patch.chunk)).astype(np.float32)
-        return triangles, unlit_glb(vertices, triangles, self._colors(patch, look, scale, store))
+        return triangles, unlit_glb(vertices, triangles, self._colors(patch, look, scale))
 
     def _uncut(self, patch: SurfacePatch, cut: Cut | None) -> NDArray[np.int32]:
         """The triangles that are not cut away."""
@@ -152,27 +152,19 @@ class SurfaceLayer:
         kept = cut.keeps(patch.vertices_m[:, cut.axis] / self._voxel_size)
         return patch.triangles[kept[patch.triangles].all(axis=1)]
 
-    def _colors(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> NDArray[np.uint8]:
+    def _colors(self, patch: SurfacePatch, look: Look, scale: Scale) -> NDArray[np.uint8]:
         view = self._view
         assert view is not None  # until then nothing is drawn
         if scale.color_by == "uncertainty":
             colors = std_colors(scale, patch.std_m)
         else:
-            seen = self._seen(patch, store) if scale.color_by == "keyframes" else np.zeros(0, np.uint8)
-            shown = Shown(np.zeros((0, 3), np.uint8), patch.log_odds, seen, patch.colors)
+            none = np.zeros(0, np.uint8)
+            shown = Shown(none, none.astype(np.int16), none, patch.colors)
             colors = voxel_colors(scale, shown, patch.vertices_m @ view.up - view.floor_m)
         if not look.shade:
             return colors
         lit = np.clip((patch.normals / 127.0) @ view.light, 0.0, 1.0)
         return (colors * (_DARKEST + (1 - _DARKEST) * lit)[:, None] + 0.5).astype(np.uint8)
-
-    def _seen(self, patch: SurfacePatch, store: VoxelStore) -> NDArray[np.uint8]:
-        """By how many keyframes' rays the voxel of each vertex was crossed, (n,)."""
-        chunk = store.chunks.get(patch.chunk)
-        if chunk is None:
-            return np.zeros(len(patch.vertices_m), np.uint8)
-        local = np.floor((patch.vertices_m - self._corner_m(patch.chunk)) / self._voxel_size)
-        return chunk.seen_at(np.clip(local, 0, CHUNK_VOXELS - 1).astype(np.int64))
 
     def _corner_m(self, key: ChunkKey) -> NDArray[np.float64]:
         return np.array(key) * (CHUNK_VOXELS * self._voxel_size)

@@ -15,12 +15,19 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
-from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, Scale, ViewOptions, scale_of, voxel_colors
+from taichi_mrf.viewer.scene.coloring import (
+    DYNAMIC_COLOR,
+    SPACE_COLORS,
+    Scale,
+    ViewOptions,
+    scale_of,
+    voxel_colors,
+)
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
-FREE = (70, 130, 200, 110)
-OCCUPIED = (253, 200, 36, 230)
+FREE = (*SPACE_COLORS["free"], 110)
+OCCUPIED = (*SPACE_COLORS["occupied"], 230)
 UNKNOWN = (0, 0, 0, 0)
 
 _MOST_PIXELS = 2048
@@ -131,8 +138,6 @@ class Look:
     point_size: float
     """In voxels."""
     shade: bool
-    dynamic: bool
-    """True if dynamic voxels have a colour of their own."""
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
 
@@ -244,7 +249,7 @@ class VoxelLayer:
         heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
         faces = facing(shown.cells) if look.shade else None
         colors = voxel_colors(look.scale, shown, heights, faces)
-        dynamic = self._is_dynamic(key, shown.cells) if look.dynamic else np.zeros(len(colors), np.bool_)
+        dynamic = self._is_dynamic(key, shown.cells)
         colors[dynamic] = DYNAMIC_COLOR
         now = _Sent(shown.cells, colors, look.point_size, int(dynamic.sum()))
         if before is not None and np.array_equal(before.cells, now.cells):
@@ -305,7 +310,6 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
         ),
         point_size=options.size,
         shade=options.shade,
-        dynamic=options.dynamic,
         up=up,
     )
 

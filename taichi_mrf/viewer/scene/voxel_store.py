@@ -127,13 +127,6 @@ class Chunk:
             voxels, cells = voxels[kept], cells[kept]
         return Shown(cells, **{name: values[voxels] for name, values in every.items()})
 
-    def seen_at(self, cells: NDArray[np.integer]) -> NDArray[np.uint8]:
-        """By how many keyframes' rays the voxels with coordinates (n, 3), 0 to 63, were crossed, (n,)."""
-        brick, local = cells // BRICK, cells % BRICK
-        rows = self._row[(brick[:, 0] * CHUNK + brick[:, 1]) * CHUNK + brick[:, 2]]
-        numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
-        return np.where(rows == _NOWHERE, 0, self.values["seen"][rows, numbers]).astype(np.uint8)
-
     def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
         """The log-odds of a voxel with coordinates (3,), 0 to 63, and the colour that cameras saw, None if it
         has none; None if it is not here."""

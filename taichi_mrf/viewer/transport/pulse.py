@@ -8,7 +8,9 @@ and reloads the page of a server that answers while the socket stays closed.
 
 The script also gives the page the colours that the system prefers until a user turns them over, shows the
 tooltips of labels, and on a phone folds the panel at first, makes it as wide as the window, and leaves out
-viser's initial view of wide windows, which may come after the page's own.
+viser's initial view of wide windows, which may come after the page's own. It writes the view into the page's
+address when its user asks for a link, and begins with the view of such an address in place of the first one
+that the server sends.
 """
 
 import http
@@ -28,21 +30,38 @@ PATH = "/alive"
 ACTIVITY = "taichi-mrf-activity"
 """The class of the element that says what is being done."""
 
+LINK = "Link to this view"
+"""Label of the button that writes the view into the page's address."""
+
 SCRIPT = (
-    """(() => {
+    (
+        """(() => {
 const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20, KEPT = "taichi-mrf-scheme";
 document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
 let timer, socket, theme, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
 const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
 const preferred = () => system.matches ? "dark" : "light";
+const numbers = location.hash.match(/^#view=([-+.,\\de]+)$/)?.[1].split(",").map(Number) ?? [];
+const isLink = numbers.length === 9 && numbers.every(Number.isFinite);
+const linked = isLink ? {
+  SetCameraPositionMessage: ["position", numbers.slice(0, 3)],
+  SetCameraLookAtMessage: ["look_at", numbers.slice(3, 6)],
+  SetCameraUpDirectionMessage: ["position", numbers.slice(6)],
+} : {};
+let view;
 const scheme = () => localStorage.getItem(KEPT) ?? preferred();
 window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
   constructor(...given) {
     super(...given);
     socket = this;
     this.addEventListener("message", ({data}) => {
-      if (innerWidth <= innerHeight) data.messages = data.messages?.filter(({initial}) => !initial);
+      if (innerWidth <= innerHeight || isLink) data.messages = data.messages?.filter(({initial}) => !initial);
       for (const message of data?.messages ?? []) {
+        if (linked[message.type]) {
+          const [name, value] = linked[message.type];
+          message[name] = value;
+          delete linked[message.type];
+        }
         if (message.type !== "ThemeConfigurationMessage") continue;
         theme = message;
         if (theme.dark_mode) {  // the server asks for the other colours
@@ -55,7 +74,17 @@ window.Worker = class extends Worker {  // viser's socket lives in one, which te
       if (data?.type === "closed") [closed, hasClosed] = [true, true];
     });
   }
+  postMessage(data, ...rest) {
+    if (data?.message?.type === "ViewerCameraMessage") view = data.message;
+    super.postMessage(data, ...rest);
+  }
 };
+document.addEventListener("click", ({target}) => {
+  if (!view || target.closest?.("button")?.textContent !== "LINK") return;
+  const parts = [...view.position, ...view.look_at, ...view.up_direction].map(part => part.toFixed(4));
+  history.replaceState(null, "", "#view=" + parts);
+  navigator.clipboard?.writeText(location.href).catch(() => {});
+}, true);
 system.addEventListener("change", () => {
   const data = {type: "message_batch", messages: [{...theme, dark_mode: false}]};
   if (theme) socket.dispatchEvent(new MessageEvent("message", {data}));
@@ -114,7 +143,10 @@ document.addEventListener("visibilitychange", () => {  // timers of a hidden pag
   ask();
 });
 })();"""
-).replace("ACTIVITY", ACTIVITY)
+    )
+    .replace("ACTIVITY", ACTIVITY)
+    .replace("LINK", LINK)
+)
 """Runs before viser's own scripts."""
 
 TAG = f"<script>{SCRIPT}</script>"

@@ -34,7 +34,7 @@ class KnobMoved(Event):
 
 NONE_YET = "none yet"
 MAP_OPTIONS = (
-    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
+    "look", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
     "axes", "pictures",
 )  # fmt: skip
 
@@ -81,7 +81,7 @@ class TunePanel(BasePanel):
             self.add_buttons("Look from", [side.capitalize() for side in get_args(Side)])
             self.add_legend()
             self.view_options.add(*MAP_OPTIONS)
-            self.view_options.offer("color_by", OF_BELIEFS)
+            self.view_options.offer("look", OF_BELIEFS)
             self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
