@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -55,4 +56,10 @@ class Reading(Conventions):
 
     def camera_of(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera that took the images."""
-        return LENSES[self.lens](recorded) if self.lens else recorded
+        return _through(self.lens, recorded) if self.lens else recorded
+
+
+@cache
+def _through(lens: str, recorded: PinholeCamera) -> PinholeCamera:
+    """The camera for a key of LENSES: a search asks for few, and tens of thousands of times."""
+    return LENSES[lens](recorded)

@@ -64,6 +64,7 @@ class Search:
         self._units = [float(each) for each in np.unique(factors.round(12)) if not np.isclose(each, 1.0)]
         self._known: dict[Reading, Floats] = {}
         self._mended: dict[Reading, Floats] = {}
+        self._measured: dict[Reading, dict[int, Floats]] = {}
         self._usable = 0, np.zeros(len(sample.pairs), dtype=bool)
         self._place = {int(frame): place for place, frame in enumerate(sample.frames)}
         cameras = [view.camera for view in sample.views.values() if isinstance(view.camera, PinholeCamera)]
@@ -94,14 +95,21 @@ class Search:
             yield inverse(poses[b]) @ poses[a] if known[a] and known[b] else None
 
     def _differences(self, reading: Reading) -> Iterator[float]:
-        views = self.sample.views
-        points = {frame: points_of(view, reading) for frame, view in views.items()}
+        views, points = self.sample.views, self._points(reading)
         for (first, second), T in zip(self.sample.pairs, self.moves(reading), strict=True):
             if T is None:
                 yield float("nan")
             else:
                 there = _difference(points[first], T, views[second], reading)
                 yield min(there, _difference(points[second], inverse(T), views[first], reading))
+
+    def _points(self, reading: Reading) -> dict[int, Floats]:
+        """The points (N, 3) of each view in the camera frame."""
+        of_camera = Reading(along_ray=reading.along_ray, lens=reading.lens)
+        if of_camera not in self._measured:
+            views = self.sample.views.items()
+            self._measured[of_camera] = {frame: points_of(view, of_camera) for frame, view in views}
+        return {frame: points * reading.factor for frame, points in self._measured[of_camera].items()}
 
     def usable(self) -> NDArray[np.bool_]:
         """The pairs that something that was tried explains: the others see different things. Of so many
@@ -212,10 +220,10 @@ def seen_by(view: View, points: Floats, T_second_first: Pose, reading: Reading) 
     if isinstance(camera, PinholeCamera):
         camera = reading.camera_of(camera)
     seen = seen_again(points, T_second_first, view.image, camera)
+    expected = seen.expected
     if reading.along_ray and isinstance(camera, PinholeCamera):
-        ranges = np.linalg.norm(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], axis=1)
-        seen = replace(seen, expected=ranges)
-    return replace(seen, measured=seen.measured * reading.factor)
+        expected = np.linalg.norm(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], axis=1)
+    return SeenAgain(expected, seen.measured * reading.factor, seen.rows, seen.columns)
 
 
 def _difference(points: Floats, T_second_first: Pose, view: View, reading: Reading) -> float:
