@@ -345,7 +345,8 @@ def test_three_images_beside_the_map(page: LivePage) -> None:
     page.tab("Images")
     page.tick("Show images")
     labels = ("measured depth", "depth rendered from the map", "accuracy")
-    sizes = "() => [...document.querySelectorAll('img')].map(i => [i.naturalWidth, i.naturalHeight])"
+    shown = "[...document.querySelectorAll('img')].filter(i => i.offsetParent)"  # in the tab that is in front
+    sizes = f"() => {shown}.map(i => [i.naturalWidth, i.naturalHeight])"
     page.until(lambda seen: page.page.evaluate(sizes).count([96, 72]) == 3, "three images")
     page.until(lambda seen: re.search(r"right \d+%", page.text()), "their score")
     text = page.text()
@@ -400,6 +401,9 @@ def test_a_link_begins_with_the_view_that_it_was_made_of(
         other.pause(1.0)
         np.testing.assert_allclose(other.position(), eye, atol=1e-3)
         assert other.problems == []
+    page.page.evaluate(
+        "history.replaceState(null, '', location.pathname + location.search)"
+    )  # for later tests
     page.tab("Map")
     page.press("Fit")
 
