@@ -6,7 +6,6 @@ import json
 import pstats
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import small_room
 from console import taichi_mrf
 
 from benchmarks.speed import profile
+from benchmarks.speed.__main__ import main as speed_main
 from benchmarks.speed.bandwidth import copy_bandwidth
 from benchmarks.speed.growth import elsewhere, fit_line, measure_growth
 from benchmarks.speed.profile import COPIES, FLOORS, Work, host_seconds
@@ -31,17 +31,13 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = "synthetic:room?width=64&height=48&frames=8"
 
 
-def bench(*flags: str, out: Path, program: Sequence[str] = ("taichi_mrf", "bench")) -> tuple[list[dict], str]:
-    """The rows and the output of `taichi-mrf bench`, or of benchmarks/speed."""
-    common = [TINY, "--voxel-sizes", "0.1", "--runtime.arch", "cpu", "--json", str(out), *flags]
-    command = [sys.executable, "-m", *program, *common]  # a process, which may start Taichi with its profiler
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
-    assert done.returncode == 0, done.stderr
-    return json.loads(out.read_text(encoding="utf-8"))["rows"], done.stdout
+def common(out: Path) -> list[str]:
+    """Arguments of all measurements."""
+    return [TINY, "--voxel-sizes", "0.1", "--frames", "4", "--runtime.arch", "cpu", "--json", str(out)]
 
 
-def speed(measure: str, *flags: str, out: Path) -> tuple[list[dict], str]:
-    return bench("--measure", measure, *flags, out=out, program=["benchmarks.speed"])
+def rows_of(out: Path) -> list[dict]:
+    return json.loads(out.read_text(encoding="utf-8"))["rows"]
 
 
 @pytest.mark.usefixtures("backend")
@@ -87,7 +83,10 @@ def test_a_picture_needs_a_known_ending() -> None:
 
 
 def test_the_command_writes_its_figures(tmp_path: Path) -> None:
-    (row,), text = bench("--frames", "4", "--plot", str(tmp_path / "a.png"), out=tmp_path / "bench.json")
+    out = tmp_path / "bench.json"
+    done = taichi_mrf("bench", *common(out), "--plot", tmp_path / "a.png")
+    assert done.returncode == 0, done.stderr
+    (row,), text = rows_of(out), done.stdout
     assert row["voxel_size"] == 0.1
     assert "10 cm" in text
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
@@ -132,9 +131,18 @@ def test_a_run_ends_with_what_the_gate_says(tmp_path: Path) -> None:
 
 
 def test_every_kernel_with_a_floor_is_found_in_a_profile(tmp_path: Path) -> None:
-    (row,), text = speed(
-        "profile", "--frames", "4", "--plot", str(tmp_path / "a.svg"), out=tmp_path / "p.json"
+    """In a process, which starts Taichi with its profiler."""
+    out = tmp_path / "p.json"
+    flags = ["--measure", "profile", *common(out), "--plot", str(tmp_path / "a.svg")]
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.speed", *flags],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=REPOSITORY,
     )
+    assert done.returncode == 0, done.stderr
+    (row,) = rows_of(out)
     found = {(kernel["stage"], kernel["name"]) for kernel in row["kernels"]}
     wanted = {(stage, name) for stage, floors in FLOORS.items() for name in floors if name not in COPIES}
     assert wanted <= found
@@ -142,7 +150,7 @@ def test_every_kernel_with_a_floor_is_found_in_a_profile(tmp_path: Path) -> None
         kernels = sum(kernel["seconds"] for kernel in row["kernels"] if kernel["stage"] == stage)
         assert 0 < kernels < seconds
     assert row["step_seconds"] > 0
-    assert "send_messages" in text
+    assert "send_messages" in done.stdout
     assert (tmp_path / "a.svg").exists()
 
 
@@ -249,11 +257,18 @@ def test_a_line_is_fitted_with_its_error() -> None:
     assert fit_line([1.0], [2.0]).slope_error is None
 
 
-def test_growth_is_measured_and_drawn_by_the_command(tmp_path: Path) -> None:
-    rows, text = speed("growth", "--frames", "4", "--plot", str(tmp_path / "g.png"), out=tmp_path / "g.json")
+@pytest.mark.usefixtures("one_backend")
+def test_growth_is_measured_and_drawn_by_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "g.json"
+    flags = ["--measure", "growth", *common(out), "--plot", str(tmp_path / "g.png")]
+    monkeypatch.setattr(sys, "argv", ["speed", *flags])
+    assert speed_main() == 0
+    rows = rows_of(out)
     assert [row["kind"] for row in rows] == ["unseen", "seen"]
     assert all(np.isfinite(row["lines"]["whole"]["slope"]) for row in rows)
-    assert "unseen" in text
+    assert "unseen" in capsys.readouterr().out
     assert (tmp_path / "g.png").exists()
 
 

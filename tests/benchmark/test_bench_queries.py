@@ -1,7 +1,6 @@
 """The benchmark of queries asks the same of the same map, and says who is missing."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 import small_room
 
 from benchmarks.speed import queries
+from benchmarks.speed.__main__ import main
 from taichi_mrf import ExportOptions, cast_rays, export_map
 from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.config.schema import Config
@@ -41,19 +41,25 @@ def test_rates_are_counts_by_seconds() -> None:
     assert (rate.millions, rate.cpu_millions) == (2.0, 1.0)
 
 
-def test_the_command_says_who_is_missing(tmp_path: Path, repository: Path) -> None:
+@pytest.mark.usefixtures("one_backend")
+def test_the_command_says_who_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("POINTS", "RAYS", "BODIES"):
+        monkeypatch.setattr(queries, name, 60)
     out = tmp_path / "queries.json"
-    command = [sys.executable, "-m", "benchmarks.speed", "synthetic:room?width=64&height=48&frames=3"]
-    command += ["--measure", "queries", "--voxel-sizes", "0.2", "--runtime.arch", "cpu", "--json", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository)
-    assert done.returncode == 0, done.stderr
+    command = ["speed", "synthetic:room?width=64&height=48&frames=3", "--measure", "queries"]
+    command += ["--voxel-sizes", "0.2", "--runtime.arch", "cpu", "--json", str(out)]
+    monkeypatch.setattr(sys, "argv", command)
+    assert main() == 0
+    said = capsys.readouterr().out
     report = json.loads(out.read_text(encoding="utf-8"))
     assert report["measured"] == "queries"
     assert set(report["rows"][0]["rates"]) == NAMES
-    assert "distance and gradient" in done.stdout
+    assert "distance and gradient" in said
     for name in ("OctoMap", "Open3D"):
         line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
-        assert (line in done.stdout) == (name in queries.missing_peers())
+        assert (line in said) == (name in queries.missing_peers())
 
 
 @pytest.mark.usefixtures("one_backend")

@@ -15,7 +15,18 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from console import COARSE, FAST, ROOM, as_process, assert_refused, mapped, report_of, taichi_mrf
+from console import (
+    COARSE,
+    FAST,
+    ROOM,
+    as_process,
+    assert_refused,
+    complaints,
+    mapped,
+    report_of,
+    signalled,
+    taichi_mrf,
+)
 from full_disk import files_up_to
 from new_interpreter import obey_hangups, output
 
@@ -350,15 +361,38 @@ def test_a_full_disk_names_the_file_and_leaves_no_half(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def interrupted_run(out: Path, number: int, presses: int = 1, flags: tuple[str, ...] = FAST) -> int:
-    """Start a run on a terminal, stop it once it shows progress, and return its exit status.
+LONG = "synthetic:room?frames=300&width=80&height=60"
+"""A recording that is stopped long before its end."""
 
-    SIGHUP comes with the end of the terminal, as when a connection breaks.
-    """
+
+def test_ctrl_c_keeps_what_is_mapped(tmp_path: Path) -> None:
+    with signalled(signal.SIGINT, "Adding", step=3):
+        done = taichi_mrf("map", LONG, "--out", tmp_path / "out", *FAST)
+    assert done.returncode == 130, done.stderr
+    assert_stopped(tmp_path / "out")
+
+
+def assert_stopped(out: Path) -> None:
+    """A run was stopped early and left its map."""
+    report = report_of(out)
+    assert report["interrupted"] is True
+    assert 0 < report["keyframes"] < 270
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def test_sigterm_saves_the_map_and_leaves_out_pictures_and_scores(tmp_path: Path) -> None:
+    with signalled(signal.SIGTERM, "Adding", step=3):
+        done = taichi_mrf("map", LONG, "--out", tmp_path / "out", *COARSE)
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    assert_stopped(tmp_path / "out")
+    assert report_of(tmp_path / "out")["accuracy"] is None
+
+
+def test_the_end_of_the_terminal_saves_the_map_and_leaves_out_pictures_and_scores(tmp_path: Path) -> None:
+    """SIGHUP comes as when a connection breaks, to a process that shows a bar."""
     main_end, program_end = pty.openpty()
-    source = "synthetic:room?frames=300&width=80&height=60"
     with subprocess.Popen(
-        [sys.executable, "-m", "taichi_mrf", "map", source, "--out", out, *flags],
+        [sys.executable, "-m", "taichi_mrf", "map", LONG, "--out", tmp_path / "out", *COARSE],
         stdin=program_end,
         stdout=program_end,
         stderr=program_end,
@@ -366,46 +400,19 @@ def interrupted_run(out: Path, number: int, presses: int = 1, flags: tuple[str, 
     ) as process:
         os.close(program_end)
         shown = b""
-        sent = 0
-        while True:
-            try:
-                shown += os.read(main_end, 4096)
-            except OSError:  # the other end is closed: the program has ended
-                break
-            if sent == 0 and b"Adding" in shown:
-                process.send_signal(number)
-                sent = 1
-                if number == signal.SIGHUP:
-                    break
-            elif 0 < sent < presses and b"Stopping" in shown:
-                process.send_signal(number)
-                sent += 1
+        while b"Adding" not in shown:
+            shown += os.read(main_end, 4096)
+        process.send_signal(signal.SIGHUP)
         os.close(main_end)
-    return process.returncode
-
-
-def test_ctrl_c_keeps_what_is_mapped(tmp_path: Path) -> None:
-    assert interrupted_run(tmp_path / "out", signal.SIGINT) == 130
-    report = report_of(tmp_path / "out")
-    assert report["interrupted"] is True
-    assert 0 < report["keyframes"] < 270
-    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_sigterm_saves_the_map_and_leaves_out_pictures_and_scores(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    assert interrupted_run(tmp_path / "out", number, flags=COARSE) == 128 + number
-    report = report_of(tmp_path / "out")
-    assert report["interrupted"] is True
-    assert report["accuracy"] is None
-    assert 0 < report["keyframes"] < 270
-    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+    assert process.returncode == 128 + signal.SIGHUP
+    assert_stopped(tmp_path / "out")
+    assert report_of(tmp_path / "out")["accuracy"] is None
 
 
 def test_ctrl_c_twice_aborts_and_leaves_nothing(tmp_path: Path) -> None:
-    assert interrupted_run(tmp_path / "out", signal.SIGINT, presses=2) == 130
+    with signalled(signal.SIGINT, "Adding", step=3, times=2):
+        done = taichi_mrf("map", LONG, "--out", tmp_path / "out", *FAST)
+    assert (done.returncode, complaints(done.stderr)) == (130, "taichi-mrf: aborted\n")
     assert not (tmp_path / "out").exists()
 
 

@@ -3,16 +3,13 @@
 import csv
 import json
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from console import FAST, ROOM, assert_refused, complaints, mapped, report_of, taichi_mrf
+from console import FAST, ROOM, assert_refused, complaints, mapped, report_of, signalled, taichi_mrf
 from small_scenes import make_data
 
 from taichi_mrf.evaluation.tables import entry_text
@@ -89,18 +86,12 @@ def test_a_second_run_computes_nothing_and_says_the_same(table3: tuple[Path, str
 
 
 def test_ctrl_c_keeps_what_was_found(table3: tuple[Path, str], data: Path, tmp_path: Path) -> None:
-    command = [
-        sys.executable, "-m", "taichi_mrf", "eval", "table3", "--data", data, "--out", tmp_path,
-        "--voxel-sizes", "0.2", "0.05", "--seeds", "0", *CPU,
-    ]  # fmt: skip
+    command = ("eval", "table3", "--data", data, "--out", tmp_path, "--voxel-sizes", "0.2", "0.05")
     ledger = tmp_path / "table3.jsonl"
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        while process.poll() is None and not (ledger.exists() and ledger.read_text().count("\n") > 1):
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        printed, said = process.communicate()
-    assert (process.returncode, complaints(said)) == (130, "")
-    assert "the same command continues from here" in " ".join(printed.split())
+    with signalled(signal.SIGINT, "table3", step=2):
+        done = taichi_mrf(*command, "--seeds", "0", *CPU)
+    assert (done.returncode, complaints(done.stderr)) == (130, "")
+    assert "the same command continues from here" in " ".join(done.stdout.split())
     kept = ledger.read_text()
     assert 1 <= kept.count("\n") - 1 < (table3[0] / "table3.jsonl").read_text().count("\n") - 1
     assert not (tmp_path / "table3.csv").exists()

@@ -4,15 +4,13 @@ import csv
 import json
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from console import complaints, taichi_mrf
+from console import complaints, signalled, taichi_mrf
 from laser_logs import flaser
 
 from taichi_mrf.cli.main import BAD_INPUT, main
@@ -188,26 +186,13 @@ def test_the_table_of_the_comparison_is_that_of_the_report(compared: tuple[Path,
 
 def test_ctrl_c_keeps_what_is_there(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = subprocess.Popen(
-        [
-            sys.executable, "-m", "taichi_mrf", "laser", "synthetic:floor-plan?scans=400", "--out", str(out),
-            "--method", "mh", "--iterations", "1000000", "--runtime.arch", "cpu",
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    try:
-        while not out.exists() and process.poll() is None:  # made before the scans are read
-            time.sleep(0.05)
-        time.sleep(3.0)  # whether it reads, builds or samples by now: it ends with a map
-        process.send_signal(signal.SIGINT)
-        printed, complaints = process.communicate()
-    finally:
-        process.kill()
-    assert process.returncode == 130, complaints
-    assert complaints == ""
-    assert "Stopped before the end" in printed
+    with signalled(signal.SIGINT, "mh", step=5):
+        done = laser(
+            SMALL, "--out", out, "--method", "mh", "--iterations", "1000000", "--runtime.arch", "cpu"
+        )  # fmt: skip
+    assert done.returncode == 130, done.stderr
+    assert complaints(done.stderr) == ""
+    assert "Stopped before the end" in done.stdout
     assert names(out) == FILES
     report = report_of(out)
     assert report["interrupted"]

@@ -4,6 +4,7 @@ import io
 import json
 import logging
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -50,6 +51,26 @@ def taichi_mrf(
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else 1
     return subprocess.CompletedProcess(list(arguments), status, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def signalled(number: int, at: str, *, step: int = 1, times: int = 1) -> Iterator[None]:
+    """The program in this process gets a signal, once or more often, when it says that so many steps of the
+    stage ``at`` are done."""
+    advance, left = progress.ProgressBar.advance, [number] * times
+
+    def advance_and_signal(bar: progress.ProgressBar, stage: str, done: int, *rest: Any, **more: Any) -> None:
+        advance(bar, stage, done, *rest, **more)
+        while left and stage == at and done >= step:
+            signal.raise_signal(left.pop())
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a run in the background ignores it
+    try:
+        with patch.object(progress.ProgressBar, "advance", advance_and_signal):
+            yield
+        assert not left, f"the program did not come to step {step} of {at}"
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

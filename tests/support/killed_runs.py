@@ -14,10 +14,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import patch
 
 import trimesh
+from console import taichi_mrf
 
 from taichi_mrf.config.schema import load
 from taichi_mrf.methods.map_file import open_map_file, read_header
@@ -46,11 +50,16 @@ class Run:
     kills: list[Killed] = field(default_factory=list)
 
     def go(self, kill_at: int | None = None, delay_s: float = 0.0) -> list[str]:
-        """Start or resume it; kill it after so many steps, if it makes so many. Returns the stages of its
-        steps. Raises AssertionError if it fails."""
+        """Start or resume it; kill it after so many steps, if it makes so many. One that is not to be killed
+        runs in this process. Returns the stages of its steps. Raises AssertionError if it fails."""
         resume = () if not self.folder.exists() else ("--resume",)
-        receive, send = os.pipe()
         arguments = ("map", SOURCE, "--out", str(self.folder), *OPTIONS, *self.options, *resume)
+        if kill_at is None:
+            with told_steps() as told:
+                done = taichi_mrf(*arguments)
+            assert done.returncode == 0, done.stderr
+            return told
+        receive, send = os.pipe()
         command = [sys.executable, __file__, str(send), *arguments]
         with subprocess.Popen(
             command, pass_fds=[send], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -116,28 +125,37 @@ def disturbed(folder: Path, draw: random.Random, steps: int, options: tuple[str,
     return run
 
 
-def _tell_steps(pipe: int) -> None:
-    """Have the program say each of its steps."""
+@contextmanager
+def told_steps(pipe: int | None = None) -> Iterator[list[str]]:
+    """Have the program say each of its steps: in the list, or on a pipe."""
     from taichi_mrf.cli.map import keep
     from taichi_mrf.cli.shared.progress import ProgressBar
+
+    told: list[str] = []
+
+    def tell(stage: str) -> None:
+        if pipe is None:
+            told.append(stage)
+        else:
+            os.write(pipe, f"{stage}\n".encode())
 
     advance, write_text = ProgressBar.advance, keep.write_text
 
     def told_advance(self: ProgressBar, stage: str, *rest: int) -> None:
-        os.write(pipe, f"{stage}\n".encode())
+        tell(stage)
         advance(self, stage, *rest)
 
     def told_write(path: Path, text: str) -> None:
-        os.write(pipe, b"Keeping\n")
+        tell("Keeping")
         write_text(path, text)
 
-    ProgressBar.advance = told_advance  # type: ignore[method-assign]
-    keep.write_text = told_write
+    with patch.object(ProgressBar, "advance", told_advance), patch.object(keep, "write_text", told_write):
+        yield told
 
 
 if __name__ == "__main__":
     os.set_inheritable(int(sys.argv[1]), False)
-    _tell_steps(int(sys.argv[1]))
     from taichi_mrf.cli.main import main
 
-    sys.exit(main(sys.argv[2:]))
+    with told_steps(int(sys.argv[1])):
+        sys.exit(main(sys.argv[2:]))
