@@ -26,6 +26,8 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 CAMERA = PinholeCamera(width=160, height=120, fx=90.0, fy=90.0, cx=79.5, cy=59.5)
 KITCHEN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seven_scenes_redkitchen"
 VOXEL = 0.05
