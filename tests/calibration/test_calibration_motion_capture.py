@@ -37,10 +37,9 @@ def test_the_lag_is_found_from_speeds_to_less_than_an_interval(lag: float) -> No
     assert found.correlation > 0.9
 
 
-@pytest.mark.parametrize("lag", [-0.4, 0.0871])
-def test_alignment_finds_lag_and_markers_within_its_standard_error(lag: float) -> None:
+def test_alignment_finds_lag_and_markers_within_its_standard_error() -> None:
     z, poses = [], []
-    for seed in range(6):
+    for seed, lag in enumerate((-0.4, 0.0871) * 3):
         alignment, _ = aligned(lag, noise_px=0.1, noise_m=1e-4, seed=seed)
         assert alignment.lag_error < 5e-4
         assert alignment.lag == pytest.approx(lag, abs=2e-3)
@@ -48,7 +47,7 @@ def test_alignment_finds_lag_and_markers_within_its_standard_error(lag: float) -
         poses.append(alignment.T_camera_body)
     assert np.sqrt(np.mean(np.square(z))) < 2.0
     assert np.abs(np.mean(z)) * np.sqrt(len(z)) < 4
-    truth = captured(lag, SECONDS, np.random.default_rng(0)).T_camera_body
+    truth = captured(0.0, SECONDS, np.random.default_rng(0)).T_camera_body
     assert np.abs(np.mean(poses, axis=0)[:3, 3] - truth[:3, 3]).max() < 1e-3
 
 

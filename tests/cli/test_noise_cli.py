@@ -18,6 +18,7 @@ from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.noise_fit import SigmaLaw
+from taichi_mrf.runs import folder
 from taichi_mrf.tune.working_set import read_working_set
 from taichi_mrf.viewer.tune.messages import FrameChoice
 
@@ -82,8 +83,9 @@ def noise_in(path: Path) -> Any:
     return yaml.safe_load(path.read_text())["sensor"]
 
 
-def test_live_learns_what_map_learns(tmp_path: Path, learnt: Path) -> None:
+def test_live_learns_what_map_learns(tmp_path: Path, learnt: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a static world, as map's is."""
+    monkeypatch.setattr(folder, "write_pictures", lambda *_: [])  # which say nothing of noise
     flags = (*FINE, "--evaluation.hold-out", "4", "--time.half-life-s", "0", *TOO_SMALL, "--noise", "auto")
     done = taichi_mrf("live", ROOM, "--out", tmp_path / "live", "--exit-when-done", "--port", "0", *flags)
     assert done.returncode == 0, done.stderr
@@ -135,8 +137,8 @@ def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
     learnt = LearntSigma(SigmaLaw(1.5, 0.01), 4, 4000, 1.8, 0.1, 0.2, seconds=2.5)
     monkeypatch.setattr(sequence, "sigma_of_glance", lambda *_, **__: learnt)
     learns, given = tmp_path / "learns", ("--noise", "given")
-    for folder, flags in ((learns, ()), (tmp_path / "given", given)):
-        done = taichi_mrf("map", ROOM, "--out", folder, "--limit", "3", *FAST, *flags)
+    for out, flags in ((learns, ()), (tmp_path / "given", given)):
+        done = taichi_mrf("map", ROOM, "--out", out, "--limit", "3", *FAST, *flags)
         assert done.returncode == 0, done.stderr
     assert load(learns / "config.yaml").sensor.sigma_scale == 1.5
     notes = [note for note in report_of(learns)["notes"] if note.startswith("Sigma was learnt")]
