@@ -31,7 +31,6 @@ def test_an_experiment_of_the_laboratory_runs(repository: Path, tmp_path: Path) 
     assert (tmp_path / "out" / "endless.csv").stat().st_size > 0
 
 
-@pytest.mark.soak
 def test_the_gpu_script_runs_through_on_a_cpu_and_says_so(repository: Path, tmp_path: Path) -> None:
     out = tmp_path / "gpu.json"
     text = run(repository / "benchmarks" / "gpu.py", "--arch", "cpu", "--quick", "--json", str(out))
