@@ -100,7 +100,7 @@ def live_images(page: LivePage) -> Image.Image:
     page.tab("Images")
     page.select("View", "chosen keyframe")
     page.tick("Show images")
-    page.page.locator("img").nth(2).wait_for(state="visible")
+    page.page.locator("img:visible").nth(2).wait_for()
     page.until_settled()
     picture = panel(page)
     page.tick("Show images", on=False)
