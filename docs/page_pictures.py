@@ -101,7 +101,7 @@ def live_images(page: LivePage) -> Image.Image:
     page.select("View", "chosen keyframe")
     page.tick("Show images")
     page.page.locator("img:visible").nth(2).wait_for()
-    page.until_settled()
+    page.until(lambda seen: seen.settled, "images at rest")
     picture = panel(page)
     page.tick("Show images", on=False)
     return picture
