@@ -260,7 +260,8 @@ def key_html(options: ViewOptions) -> str:
         named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
     spans = "".join(
-        f'<span style="{swatch};background:rgb{color}"></span>{name}' for name, color in named.items()
+        f'<span style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</span>'
+        for name, color in named.items()
     )
     unknown = " · unknown: nothing" if options.cut_axis != "none" else ""
     return f'<div style="font-size:0.85em">{spans}{unknown}</div>' if named else ""
