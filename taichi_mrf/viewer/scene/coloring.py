@@ -259,8 +259,9 @@ def key_html(options: ViewOptions) -> str:
     if options.color_by == "changes":
         named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
+    together = "display:inline-block"
     spans = "".join(
-        f'<span style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</span>'
+        f'<div style="{together}"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
     unknown = " · unknown: nothing" if options.cut_axis != "none" else ""
