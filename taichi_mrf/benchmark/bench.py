@@ -80,6 +80,9 @@ class BenchRow:
         """All figures under their names, with the ratios and their targets."""
         alone, whole = self.targets or (None, None)
         ratios = {"ratio_alone": self.ratio_alone, "ratio_whole": self.ratio_whole}
+        if self.octomap is not None:
+            ratios["cpu_ratio_alone"] = self.alone.cpu / self.octomap.cpu
+            ratios["cpu_ratio_whole"] = self.whole.cpu / self.octomap.cpu
         return asdict(self) | ratios | {"target_alone": alone, "target_whole": whole}
 
 

@@ -31,8 +31,8 @@ Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None
 """Measurements: tables to print, figures to write, and what draws them, if they can be drawn."""
 
 
-RATIOS = {"ratio_alone": "a keyframe without re-inference", "ratio_whole": "a keyframe"}
-"""The figures that ``--gate`` compares, and their names."""
+RATIOS = {"cpu_ratio_alone": "a keyframe without re-inference", "cpu_ratio_whole": "a keyframe"}
+"""The figures that ``--gate`` compares, and their names: processors' time repeats better than the clock's."""
 
 WORSE = 1.1
 """A ratio that has grown by more than this factor is worse."""
@@ -143,7 +143,8 @@ def _ratios_in(path: Path, options: Bench) -> dict[tuple[float, str], float]:
 def _worse(rows: Sequence[dict[str, Any]], allowed: dict[tuple[float, str], float]) -> list[str]:
     """A line for each ratio that is more than WORSE of what is allowed."""
     return [
-        f"{row['voxel_size']:g} m: {RATIOS[name]} takes {row[name]:.3f} of OctoMap's time, {then:.3f} before"
+        f"{row['voxel_size']:g} m: {RATIOS[name]} takes {row[name]:.3f} of OctoMap's processor time, "
+        f"{then:.3f} before"
         for row in rows
         for (size, name), then in allowed.items()
         if size == row["voxel_size"] and row[name] > WORSE * then

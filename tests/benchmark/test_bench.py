@@ -93,6 +93,8 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     if octomap_available():
         assert row["ratio_whole"] == pytest.approx(row["whole"]["wall"] / row["octomap"]["wall"])
         assert row["ratio_alone"] == pytest.approx(row["alone"]["wall"] / row["octomap"]["wall"])
+        assert row["cpu_ratio_whole"] == pytest.approx(row["whole"]["cpu"] / row["octomap"]["cpu"])
+        assert row["cpu_ratio_alone"] == pytest.approx(row["alone"]["cpu"] / row["octomap"]["cpu"])
     else:
         assert row["ratio_whole"] is None
         assert "taichi-mrf[bench]" in text
@@ -102,13 +104,16 @@ def test_the_gate_closes_when_a_ratio_has_grown(tmp_path: Path) -> None:
     if not octomap_available():
         pytest.skip("OctoMap is not installed: pip install 'taichi-mrf[bench]'")
     options = Bench(source=TINY, voxel_sizes=(0.1,))
-    before, rows = tmp_path / "before.json", [{"voxel_size": 0.1, "ratio_alone": 0.2, "ratio_whole": 0.3}]
+    before, rows = (
+        tmp_path / "before.json",
+        [{"voxel_size": 0.1, "cpu_ratio_alone": 0.2, "cpu_ratio_whole": 0.3}],
+    )
     before.write_text(json.dumps({"source": TINY, "rows": rows}))
     allowed = bench_command._ratios_in(before, options)
     assert bench_command._worse(rows, allowed) == []
-    slower = [{"voxel_size": 0.1, "ratio_alone": 0.21, "ratio_whole": 0.34}]
+    slower = [{"voxel_size": 0.1, "cpu_ratio_alone": 0.21, "cpu_ratio_whole": 0.34}]
     (line,) = bench_command._worse(slower, allowed)
-    assert line == "0.1 m: a keyframe takes 0.340 of OctoMap's time, 0.300 before"
+    assert line == "0.1 m: a keyframe takes 0.340 of OctoMap's processor time, 0.300 before"
     with pytest.raises(ConfigError, match=r"for voxels of 0\.05 0\.1 m"):
         bench_command._ratios_in(before, Bench(source=TINY, voxel_sizes=(0.05, 0.1)))
     with pytest.raises(ConfigError, match=r"was measured on .*room.*, not on kitchen"):
@@ -121,7 +126,7 @@ def test_a_run_ends_with_what_the_gate_says(tmp_path: Path) -> None:
     if not octomap_available():
         pytest.skip("OctoMap is not installed: pip install 'taichi-mrf[bench]'")
     before = tmp_path / "before.json"
-    tiny = {"voxel_size": 0.1, "ratio_alone": 1e-6, "ratio_whole": 1e9}
+    tiny = {"voxel_size": 0.1, "cpu_ratio_alone": 1e-6, "cpu_ratio_whole": 1e9}
     before.write_text(json.dumps({"source": TINY, "rows": [tiny]}))
     command = ["bench", TINY, "--voxel-sizes", "0.1", "--frames", "2", "--gate", str(before)]
     done = taichi_mrf(*command, "--runtime.arch", "cpu")

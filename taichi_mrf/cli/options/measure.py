@@ -38,8 +38,8 @@ class Bench:
     """Draw the figures to this file (.png, .svg or .pdf)."""
 
     gate: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Compare the ratios to OctoMap with those of an earlier --json FILE, made of the same source; end with
-    exit status 1 if one of them is more than 10% worse."""
+    """Compare the processors' time, as a share of OctoMap's, with that of an earlier --json FILE, made of the
+    same source; end with exit status 1 if a share is more than 10% larger."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
