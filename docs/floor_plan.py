@@ -69,6 +69,6 @@ def direct_uses(floors: Floors, name: str) -> list[str]:
 
 
 def all_uses(floors: Floors, name: str) -> set[str]:
-    """What a package uses, directly or through others."""
+    """Packages that a package uses, directly or through others."""
     uses = set(floors[name]["uses"])
     return uses.union(*(all_uses(floors, used) for used in uses))

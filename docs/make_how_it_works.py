@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def one_ray() -> NDArray[np.float64]:
-    """What one ray alone says of each of its voxels: the log-odds of its map less the prior's."""
+    """Votes of one ray alone on each of its voxels: the log-odds of its map less the prior's."""
     m = tm.MRFMap(VOXEL_M, noise=NOISE)
     one_pixel = tm.PinholeCamera(width=1, height=1, fx=70.0, fy=70.0, cx=0.0, cy=0.0)
     m.add_keyframe([[WALL_M]], along_a_row_of_voxels(), one_pixel)

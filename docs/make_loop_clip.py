@@ -45,7 +45,7 @@ LOWER_M, UPPER_M = (-11.8, -7.0), (11.8, 7.0)
 """Corners of the picture, x and y."""
 
 CEILING_M = 1.1
-"""What is higher is left out, in the world's z; the floor is at -1.2."""
+"""Height above which all is left out, in the world's z; the floor is at -1.2."""
 
 FLOOR_M = -1.25
 COLORS = 24
@@ -60,7 +60,7 @@ WAITING, MOVED, STAYS = (230, 0, 126), (0, 150, 136), (150, 155, 165)
 
 @dataclass(frozen=True)
 class Shot:
-    """What the map is after so many seconds: heights seen from above, where the cameras are, (N, 2) metres,
+    """State of the map after so many seconds: heights seen from above, where the cameras are, (N, 2) metres,
     how many of them are still to move, and which moment this is."""
 
     heights_m: NDArray[np.float64]

@@ -20,7 +20,7 @@ CLOSER = -900
 """Turns of the mouse's wheel, so that the person fills the page."""
 
 PAST_S = (26, 24, 22, 21, 20, 19, 18, 16, 14)
-"""Where the slider is moved at the end, in seconds."""
+"""Place of the slider at the end, in seconds."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What a live run shows beside its map: rays, images of a view, and OctoMap's way with the same frames."""
+"""Views of a live run beside its map: rays, images of a view, and OctoMap's way with the same frames."""
 
 from collections.abc import Iterable
 

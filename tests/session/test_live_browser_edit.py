@@ -96,7 +96,7 @@ def until_count(page: LivePage, count: int, what: str) -> None:
 
 
 def at_rest(page: LivePage) -> Seen:
-    """What the page shows once it no longer changes: small changes of colour come late."""
+    """Screenshot of the page once it no longer changes: small changes of colour come late."""
     seen = page.until(lambda seen: seen.settled, "a settled map")
     while True:
         page.pause(1.0)

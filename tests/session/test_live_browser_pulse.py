@@ -82,7 +82,7 @@ def until_it_says(page: LivePage, *words: str) -> None:
 
 
 def has_reloaded(page: LivePage) -> bool:
-    """Whether the page has lost the mark that a test has set in it."""
+    """True if the page has lost the mark that a test has set in it."""
     from playwright.sync_api import Error
 
     try:

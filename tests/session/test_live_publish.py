@@ -24,7 +24,7 @@ def publisher_of(m: OccupancyMap) -> Publisher:
 
 
 def told(m: OccupancyMap) -> dict[tuple[int, ...], tuple[bytes, bytes]]:
-    """What a viewer that knows all of a map knows, by brick."""
+    """Knowledge of a viewer that has all of a map, by brick."""
     pool = m.view.pool
     slots = pool.in_use
     rows = zip(

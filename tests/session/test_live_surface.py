@@ -1,4 +1,4 @@
-"""What the live page gets once it is shown: the measured surface, and readings of the map."""
+"""Updates that the live page gets once it is shown: the measured surface, and readings of the map."""
 
 from dataclasses import replace
 from pathlib import Path

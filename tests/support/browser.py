@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # an extra that only these tests need
     from playwright.sync_api import Browser, Download, Locator
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "test-artifacts"
-"""Where screenshots go; git ignores it."""
+"""Folder of screenshots; git ignores it."""
 
 FLAGS = [
     "--no-sandbox",
@@ -134,7 +134,7 @@ _POSITION = """async name => {
 
 
 def missing() -> str | None:
-    """What there is not on this machine to run a browser with, None if all is there."""
+    """Part that this machine lacks to run a browser, None if all is there."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (extra: dev)"
     if _chromium() is None:
@@ -183,13 +183,13 @@ class Seen:
 
     @property
     def agrees(self) -> bool:
-        """Whether the scene holds as many voxels and triangles as the page says."""
+        """True if the scene holds as many voxels and triangles as the page says."""
         said = self.said, self.said_baseline, self.said_triangles
         return said == (self.voxels, self.baseline, self.triangles)
 
     @property
     def settled(self) -> bool:
-        """Whether the map is at rest, and the scene shows all that the page says."""
+        """True if the map is at rest, and the scene shows all that the page says."""
         return self.agrees and "up to date" in self.activity
 
 
@@ -210,7 +210,7 @@ class LivePage:
         self.page.wait_for_function("() => window.__viserMutable?.scene != null")
 
     def look(self) -> Seen:
-        """What is to be seen now."""
+        """Things to be seen now."""
         found = self.page.evaluate(_LOOK)
         words = found.pop("counts").replace(",", "").split()
         said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
@@ -297,7 +297,7 @@ class LivePage:
     def places(
         self, prefix: str, kind: str, local: tuple[float, float, float] = (0, 0, 0)
     ) -> list[list[float]]:
-        """Where nodes are on the page, each as x, y in pixels and metres from the eye: the ``points`` of
+        """Places of nodes on the page, each as x, y in pixels and metres from the eye: the ``points`` of
         clouds, some ``vertices`` of meshes, the middle of a frustum's ``picture``, or a point of the node
         itself (``origin``)."""
         return self.page.evaluate(_PROJECT, [prefix, kind, local])
@@ -314,7 +314,7 @@ class LivePage:
         self.page.mouse.click(x, y, delay=50)
 
     def position(self, node: str = "") -> tuple[float, float, float]:
-        """Where a node is in the map's world, in metres; without a name, the eye that looks at the scene."""
+        """Place of a node in the map's world, in metres; without a name, the eye that looks at the scene."""
         return tuple(self.page.evaluate(_POSITION, node))
 
     def screenshot(self, name: str) -> Path:

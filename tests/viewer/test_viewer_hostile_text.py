@@ -38,7 +38,7 @@ HOSTILE = (
 """Works as a file's name, but for the slashes."""
 
 SHOWN = "<iframe srcdoc="
-"""What of it must be seen as text wherever it is shown."""
+"""Part of it that must be seen as text wherever it is shown."""
 
 FOREIGN = """() => ({
   ran: window.ran ?? null,

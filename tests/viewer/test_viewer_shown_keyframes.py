@@ -1,4 +1,4 @@
-"""What the page remembers of keyframes: all that can be changed, and a bounded share of what is frozen."""
+"""The page's memory of keyframes: all that can be changed, and a bounded share of what is frozen."""
 
 import numpy as np
 

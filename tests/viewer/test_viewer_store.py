@@ -24,7 +24,7 @@ def world_of(store: VoxelStore, log_odds: float, cut: Cut | None = None) -> dict
 
 
 def expected(bricks: dict[tuple[int, ...], np.ndarray], log_odds: float) -> dict[tuple[int, ...], int]:
-    """The same by brute force."""
+    """The answer by brute force."""
     found = {}
     for brick, values in bricks.items():
         for offset, value in zip(offsets_in_brick(), values, strict=True):

@@ -96,7 +96,7 @@ def parts_of(glb: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def tone_mapped(light: np.ndarray) -> np.ndarray:
-    """What three.js makes of linear light with ACESFilmicToneMapping, as sRGB (n, 3) uint8."""
+    """Colours that three.js makes of linear light with ACESFilmicToneMapping, as sRGB (n, 3) uint8."""
     into = [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
     back = [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
     v = (light.astype(np.float64) / 0.6) @ np.array(into).T

@@ -1,4 +1,4 @@
-"""What the guard knows of viser's internals still holds; each failure says what to mend, and where."""
+"""The guard's knowledge of viser's internals still holds; each failure says what to mend, and where."""
 
 from __future__ import annotations
 
