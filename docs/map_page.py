@@ -15,10 +15,10 @@ import taichi_mrf as tm
 
 @cache
 def map_page() -> str:
-    """Map the room, a third of a minute on two cores, and export it. ``mkdocs serve`` does so once."""
+    """Map the room and export it. ``mkdocs serve`` does so once."""
     tm.init("cpu")
     m = tm.MRFMap(voxel_size=0.05, noise=tm.PolynomialNoise(sigma=(0.001504, -0.00152, 0.0019)))
-    for frame in tm.open_dataset("synthetic:room?frames=29", color=True):
+    for frame in tm.open_dataset("synthetic:room?frames=29&width=320&height=240", color=True):
         m.add(frame)
     m.infer()
     with tempfile.TemporaryDirectory() as folder:

@@ -4,7 +4,7 @@ import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -433,6 +433,36 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         page.slide("Threshold", 0.5)
         narrow.until(lambda other: other.agrees and other.voxels == before.voxels, "the same for both")
         assert narrow.problems == []
+
+
+CUT_OFF = """() => [...document.querySelectorAll("button, label, p, td, [role=tab]")].filter(element => {
+  const {left, right, width} = element.getBoundingClientRect();
+  const fits = element.role === "tab" || element.scrollWidth <= element.clientWidth + 1;
+  return element.offsetParent && width && (left < 0 || right > innerWidth || !fits);
+}).map(element => element.textContent.trim())"""
+"""Texts of widgets that leave the window or do not fit into their place."""
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "scheme"),
+    [(1280, 800, "dark"), (1920, 1080, "light"), (390, 844, "light"), (390, 844, "dark")],
+)
+def test_nothing_is_cut_off(
+    program: LiveProgram, browser: "Browser", width: int, height: int, scheme: Literal["dark", "light"]
+) -> None:
+    with LivePage(browser, program.address, width, height) as page:
+        page.page.emulate_media(color_scheme=scheme)
+        if not page.input("Look").is_visible():
+            page.page.get_by_text("taichi_mrf", exact=True).click()
+        page.until_settled()
+        for tab in ("Map", "Keyframes", "Ray", "Images", "Save", "About"):
+            page.tab(tab)
+            page.pause(0.3)
+            assert page.page.evaluate(CUT_OFF) == [], tab
+        page.screenshot(f"{width}_{scheme}")
+        assert page.problems == []
+        page.page.evaluate("() => { document.querySelector('[role=tab]').style.marginLeft = '-3000px'; }")
+        assert "Map" in page.page.evaluate(CUT_OFF)
 
 
 def test_the_ground_and_the_axes_come_and_go(page: LivePage, saved: MRFMap) -> None:
