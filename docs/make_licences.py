@@ -30,7 +30,7 @@ SHORT = {
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "Copyright (c) 2015, Anthony Scopatz": "BSD-2-Clause",
 }
-"""What some packages state in place of a licence's short name."""
+"""Words that some packages state in place of a licence's short name."""
 
 TEXT = """# Licences
 

@@ -24,7 +24,7 @@ COMMANDS = (
     ("info", "room/map.npz"),
     ("export", "room/map.npz", "--to", "room.html"),
 )
-"""What is run from an empty folder."""
+"""Commands to run from an empty folder."""
 
 
 def main() -> None:
@@ -80,7 +80,7 @@ def environment(python: str, folder: Path, *packages: str) -> str:
 
 
 def run(*words: str, cwd: Path | None = None) -> str:
-    """What a command prints. Ends the program with its words if it fails."""
+    """Output of a command. Ends the program with its words if it fails."""
     alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=cwd, env=alone)
     if done.returncode:

@@ -321,7 +321,7 @@ class Mapper:
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
 
     def points_of(self, id: int) -> messages.MeasuredPoints:
-        """What a keyframe measured, :data:`MOST_POINTS` points at most. Raises KeyframeError."""
+        """Measured points of a keyframe, :data:`MOST_POINTS` points at most. Raises KeyframeError."""
         entry = self.roster.find(id)
         depth_m = self.depth_of(entry)
         if depth_m is None:
@@ -353,7 +353,7 @@ class Mapper:
         return map(self.posed_image, entries)
 
     def votes_at(self, points: Sequence[tuple[float, float, float]]) -> messages.Votes:
-        """What the keyframes that are on say of the voxels at some points, on average."""
+        """Votes of the keyframes that are on, on the voxels at some points, on average."""
         if not has_messages(self.map) or self.lacks_messages:
             return messages.Votes(points[0], (), known=False)
         said: defaultdict[int, float] = defaultdict(float)

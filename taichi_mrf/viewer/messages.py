@@ -155,7 +155,7 @@ class KeyframeInfo(Update):
 
 @dataclass(frozen=True)
 class MeasuredPoints(Update):
-    """What a keyframe measured: ``points_m`` (n, 3) float32 in metres, in its camera frame, and ``colors``
+    """Points that a keyframe measured: ``points_m`` (n, 3) float32 in metres, in its camera frame, and ``colors``
     (n, 3) uint8 RGB, of its colour image or else those of depth; none of a frozen keyframe."""
 
     keyframe: int
@@ -263,7 +263,7 @@ class RayAnswer(Update):
 
 @dataclass(frozen=True)
 class Votes(Update):
-    """What keyframes say of the voxel at a point (metres, world), or of those of :class:`WhoSays` on average,
+    """Votes of keyframes on the voxel at a point (metres, world), or of those of :class:`WhoSays` on average,
     the strongest first: the number of each, and the log-odds that it adds, above 0 for occupied. ``known`` is
     False if the map does not keep it, or not yet."""
 

@@ -421,7 +421,7 @@ class Page(BasePage[Panel]):
             self.ask(self._question)
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool, int | None]:
-        """What the options need: the baseline's map, the counts of keyframes, the colours of voxels, the
+        """Needs of the options: the baseline's map, the counts of keyframes, the colours of voxels, the
         measured surface, which has colours of its own, and the keyframe whose points are shown."""
         by, surface = options.color_by, options.shows == "surface"
         instead = options.shows == "points" or (surface and self.map is not None and not self.map.growing)

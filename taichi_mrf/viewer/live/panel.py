@@ -457,7 +457,7 @@ def beside(camera: viser.CameraHandle, share: ArrayLike) -> tuple[float, float]:
 
 
 def in_words(log_odds: float) -> str:
-    """What a keyframe alone would say of a voxel."""
+    """Verdict of a keyframe alone on a voxel."""
     sure = 1 / (1 + np.exp(-abs(log_odds)))
     return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
 

@@ -46,7 +46,7 @@ LOOKS: dict[LookName, tuple[Show, ColorBy]] = {
     "measured points of the keyframe": ("points", "photo"),
     "changes": ("voxels", "changes"),
 }
-"""What each look shows, and the meaning of its colour."""
+"""Content of each look, and the meaning of its colour."""
 SPACE: LookName = "free and unknown space"
 OF_BELIEFS: tuple[LookName, ...] = (
     "voxels by height",
@@ -107,7 +107,7 @@ class ViewOptions:
 
     @property
     def shows(self) -> Show:
-        """What the look shows."""
+        """Content of the look."""
         return LOOKS[self.look][0]
 
     @property

@@ -61,7 +61,7 @@ class MapScene:
         self._measured: MeasuredPoints | None = None
         self._points: viser.PointCloudHandle | None = None
         self.changes: tuple[SceneChange, ...] = ()
-        """What has appeared and left lately."""
+        """Things that have appeared and left lately."""
         self.growing = False
         """True while frames are read: a surface that was made before lacks what they add."""
         self.ground = Ground(server.scene)

@@ -223,7 +223,7 @@ class Residuals(Update):
 
 @dataclass(frozen=True)
 class HeldOutView(Update):
-    """Where the map is right in one held-out view. Pictures are (h, w, 3) uint8: ``accuracy`` is the
+    """Accuracy of the map in one held-out view. Pictures are (h, w, 3) uint8: ``accuracy`` is the
     reference, if there is one, beside the map; ``measured`` what changed between the two, if anything can
     have, beside the measured depth."""
 
@@ -237,7 +237,7 @@ class HeldOutView(Update):
 
 @dataclass(frozen=True)
 class Verdict(Update):
-    """What a search has gained: the scores, on ``views`` that were kept from it, of some parameters by name;
+    """Gain of a search: the scores, on ``views`` that were kept from it, of some parameters by name;
     the last are those that it has found."""
 
     views: int

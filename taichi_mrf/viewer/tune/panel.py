@@ -166,7 +166,7 @@ class TunePanel(BasePanel):
         return self._names.get(self.attempt.value)
 
     def show_view(self, view: t.HeldOutView) -> None:
-        """Where the map is right in a held-out view, beside the reference; what changed beside the depths."""
+        """Accuracy in a held-out view, beside the reference; changes beside the depths."""
         self._accuracy.image, self._measured.image = view.accuracy, view.measured
         self._accuracy.visible = self._measured.visible = True
         beside = f"**A** (left): {in_markdown(view.reference_title)}. " if view.reference_title else ""
