@@ -155,8 +155,8 @@ class KeyframeInfo(Update):
 
 @dataclass(frozen=True)
 class MeasuredPoints(Update):
-    """Points that a keyframe measured: ``points_m`` (n, 3) float32 in metres, in its camera frame, and ``colors``
-    (n, 3) uint8 RGB, of its colour image or else those of depth; none of a frozen keyframe."""
+    """Points that a keyframe measured: ``points_m`` (n, 3) float32 in metres, in its camera frame, and
+    ``colors`` (n, 3) uint8 RGB, of its colour image or else those of depth; none of a frozen keyframe."""
 
     keyframe: int
     points_m: NDArray[np.float32]
