@@ -34,7 +34,7 @@ from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeState
 
 MOST_POINTS = 200_000
-"""Of as many measured points of a keyframe are shown at most."""
+"""Most measured points of a keyframe that are shown."""
 
 
 @dataclass
