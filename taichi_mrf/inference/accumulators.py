@@ -47,9 +47,9 @@ def length_sum(packed: ti.i64, scale: F32) -> F32:
 
 @ti.func
 def mean_message(packed: ti.i64) -> F32:
-    """The length-weighted mean message, in [0, 1]."""
-    lengths = ti.cast(low_half(packed), ti.f32)
-    return ti.min(1.0, ti.cast(packed >> 32, ti.f32) / ti.max(lengths, 1.0))
+    """The length-weighted mean message, in [0, 1]; a mean of ones is 1 where division is not exact, too."""
+    lengths, messages = ti.max(ti.cast(low_half(packed), ti.f32), 1.0), ti.cast(packed >> 32, ti.f32)
+    return ti.select(messages >= lengths, 1.0, messages / lengths)
 
 
 def finest_scale(
