@@ -30,14 +30,14 @@ TARGETS_MS = {0.02: 10.0, 0.01: 25.0}
 FULL_TARGET_S, OCTOMAP_TARGET = 3.0, 100.0
 TESTS = (
     "sum_product",
+    "accumulators",
     "traversal",
     "topology",
     "pool",
-    "footprint",
     "ray_list",
-    "incremental",
     "forward",
-    "queries",
+    "queries_distance",
+    "backends_agree",
 )
 SWEEPS = 3
 

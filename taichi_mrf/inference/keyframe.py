@@ -264,8 +264,8 @@ class VisibleBricks:
     def on_device(self) -> BrickArrays:
         """The list on the device; it must not be empty."""
         if self.arrays is None:
-            moved = np.zeros_like(self.slots)
-            self.arrays = BrickArrays(resident(self.cells), resident(self.slots), resident(moved))
+            moved = zeros(np.int32, len(self.slots))
+            self.arrays = BrickArrays(resident(self.cells), resident(self.slots), moved)
         return self.arrays
 
 

@@ -25,7 +25,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.forward import SUPPORT
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 VOXEL = 0.1
 SIGMA_M = 0.02
