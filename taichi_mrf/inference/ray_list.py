@@ -23,7 +23,6 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR, pixel_ray
 
@@ -35,10 +34,6 @@ BITS = 4
 """Of a ray's number, for its level; the rest is the number of its block's first pixel."""
 
 TILE_BITS = TILE.bit_length() - 1
-
-GPU_PART_BITS = 3
-"""Logarithm of the side in pixels of the parts of a tile whose blocks a GPU's threads make side by side; a
-tile's larger blocks follow. A CPU's thread makes all blocks of a tile."""
 
 AGREE_VOXELS = 0.5
 AGREE_SIGMAS = 2.0
@@ -52,8 +47,7 @@ CLEAR_VOXELS = 2.0
 so that no voxel is told by the way in common that it is free, in which a surface may be."""
 
 SPREAD = 512
-"""Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many. On a GPU an
-iteration is a thread."""
+"""Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many."""
 
 
 @ti.func
@@ -135,10 +129,7 @@ class RayBundler:
         )
         counts, groups, widest = (np.zeros(tiles, np.int32) for _ in range(3))
         pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level, self._group)
-        _choose(
-            image.depth, camera.height, image.sensor, rule, pixels, counts, groups,
-            *((TILE_BITS, SPREAD) if runtime.active() == "cpu" else (GPU_PART_BITS, 1)),
-        )  # fmt: skip
+        _choose(image.depth, image.sensor, rule, pixels, counts, groups)
         rays = RayList.empty(int(counts.sum()), int(groups.sum()))
         first, first_group = (np.cumsum(each, dtype=np.int32) - each for each in (counts, groups))
         _write_down(camera.width, camera.height, pixels, first, first_group, rays, widest)
@@ -221,50 +212,31 @@ def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n
             blocks.group[b] = -1
 
 
-@ti.func
-def _merge_level(
-    rule: Template, blocks: Template, sensor: Template, height: I32, left: I32, top: I32, bits: I32, n: I32
-):
-    """Make the blocks of level ``n`` in the square of 2^bits pixels a side at pixel (left, top)."""
-    wide, high = 1 << (n + 1) // 2, 1 << n // 2
-    in_a_row = bits - (n + 1) // 2  # their number's logarithm: no divisions
-    for block in range(1 << 2 * bits - n):
-        u = left + (block & ((1 << in_a_row) - 1)) * wide
-        v = top + (block >> in_a_row) * high
-        if u + wide <= sensor.camera.width and v + high <= height:
-            _merge(rule, blocks, sensor, u, v, n)
-
-
 @kernel
 def _choose(
     depth: F32Array,
-    height: I32,
     sensor: Sensor,
     rule: _MergeRule,
     blocks: _PixelBlocks,
     counts: I32Array,
     groups: I32Array,
-    part_bits: Template,
-    spread: Template,
 ) -> None:
     """Give each pixel the levels of the block and the group that begin there, or -1 if none does; count them
     by tile.
 
-    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` and ``groups`` (tiles), zero before,
-    receive the numbers of rays and of groups with rays. Blocks of parts of a tile, 2^part_bits pixels a side,
-    are made side by side; ``spread`` iterations stand for a part or a tile.
+    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` and ``groups`` (tiles) receive the
+    numbers of rays and of groups with rays.
     """
     width = sensor.camera.width
+    height = depth.shape[0] // width
     across = (width + TILE - 1) // TILE
-    side = ti.static(1 << part_bits)
-    parts_across = (width + side - 1) // side
-    parts = parts_across * ((height + side - 1) // side)
-    for iteration in range(parts * spread):
-        if iteration % spread == 0:
-            part = iteration // spread
-            left, top = part % parts_across * side, part // parts_across * side
-            for v in range(top, ti.min(top + side, height)):
-                for u in range(left, ti.min(left + side, width)):
+    for iteration in range(counts.shape[0] * SPREAD):
+        if iteration % SPREAD == 0:
+            tile = iteration // SPREAD
+            left, top = tile % across * TILE, tile // across * TILE
+            right, bottom = ti.min(left + TILE, width), ti.min(top + TILE, height)
+            for v in range(top, bottom):
+                for u in range(left, right):
                     i = v * width + u
                     measured = depth[i]
                     blocks.nearest[i] = measured if measured > 0.0 else FAR
@@ -272,26 +244,22 @@ def _choose(
                     blocks.mean[i] = measured
                     blocks.level[i] = 0 if measured > 0.0 else -1
                     blocks.group[i] = 0
-            for n in range(1, 2 * part_bits + 1):
-                _merge_level(rule, blocks, sensor, height, left, top, part_bits, n)
-    if ti.static(part_bits < TILE_BITS):
-        for tile in range(counts.shape[0]):
-            left, top = tile % across * TILE, tile // across * TILE
-            for n in range(2 * part_bits + 1, LEVELS + 1):
-                _merge_level(rule, blocks, sensor, height, left, top, TILE_BITS, n)
-    for iteration in range(parts * spread):
-        if iteration % spread == 0:
-            part = iteration // spread
-            left, top = part % parts_across * side, part // parts_across * side
+            for n in range(1, LEVELS + 1):
+                wide, high = 1 << (n + 1) // 2, 1 << n // 2
+                in_a_row = TILE_BITS - (n + 1) // 2  # their number's logarithm: no divisions
+                for block in range(TILE * TILE >> n):
+                    u = left + (block & ((1 << in_a_row) - 1)) * wide
+                    v = top + (block >> in_a_row) * high
+                    if u + wide <= right and v + high <= bottom:
+                        _merge(rule, blocks, sensor, u, v, n)
             rays, grouped = 0, 0
-            for v in range(top, ti.min(top + side, height)):
-                for u in range(left, ti.min(left + side, width)):
+            for v in range(top, bottom):
+                for u in range(left, right):
                     i = v * width + u
                     rays += ti.cast(blocks.level[i] >= 0, ti.i32)
                     grouped += ti.cast(_has_rays(blocks, i), ti.i32)
-            tile = top // TILE * across + left // TILE
-            ti.atomic_add(counts[tile], rays)
-            ti.atomic_add(groups[tile], grouped)
+            counts[tile] = rays
+            groups[tile] = grouped
 
 
 @ti.func
