@@ -44,7 +44,7 @@ HARMLESS = (
 """Beginnings of error messages that mean no harm: the icon that browsers ask for by themselves; and the
 sorter of Gaussian splats in viser's page, which may not compile code, and which nothing here needs."""
 
-_LOOK = """() => {
+LOOK = """() => {
   const mutable = window.__viserMutable;
   const inScene = node => {
     let last = node;
@@ -211,7 +211,7 @@ class LivePage:
 
     def look(self) -> Seen:
         """Things to be seen now."""
-        found = self.page.evaluate(_LOOK)
+        found = self.page.evaluate(LOOK)
         words = found.pop("counts").replace(",", "").split()
         said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
         counts = {"said_baseline": said_baseline}
