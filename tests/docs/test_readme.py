@@ -1,5 +1,6 @@
 """The README: its first screen, and its first example as a user pastes it."""
 
+import re
 import runpy
 import subprocess
 import sys
@@ -33,16 +34,24 @@ def test_the_readme_is_short(repository: Path) -> None:
 
 def test_the_figures_of_the_pages_are_those_of_the_result_files(repository: Path) -> None:
     tables = runpy.run_path(str(repository / "docs" / "result_tables.py"))
-    _, rows = tables["read"](tables["RESULTS"] / "peers.csv")
-    for page, fewest in zip(tables["PAGES"], (9, len(rows)), strict=True):
-        text = page.read_text(encoding="utf-8")
-        assert tables["filled"](text) == text
-        told = [key for key in rows if f"\n{'| ' + ' | '.join(key)} | " in text]
-        assert len(told) >= fewest
-        one = f"| {' | '.join(told[0])} | "
-        wrong = text.replace(one, f"{one}9", 1)
-        assert wrong != text
-        assert tables["filled"](wrong) == text
+    filled, row_of = tables["filled"], tables["row_of"]
+    files = [tables["read"](path) for path in tables["RESULTS"].glob("*.csv")]
+    readme, *pages = [page.read_text(encoding="utf-8") for page in tables["PAGES"]]
+    headers = re.findall(r"^(\|.*)\n\| ---", "\n".join(pages), re.MULTILINE)
+    from_files = [row_of(columns) for columns, _ in files]
+    assert sorted(headers) == sorted(["| question | answer | command |", *from_files])
+    assert any(header in readme for header in from_files)
+    for text in (readme, *pages):
+        assert filled(text) == text
+        for columns, rows in files:
+            _, header, below = text.partition(f"{row_of(columns)}\n")
+            told = [key for key in rows if f"\n{row_of(list(key))} " in below.partition("\n\n")[0]]
+            assert not header or len(told) >= (9 if text is readme else len(rows)), columns
+            for key in told:
+                one = f"\n{row_of(list(key))} "
+                wrong = text.replace(header + below, header + below.replace(one, f"{one}9", 1))
+                assert wrong != text
+                assert filled(wrong) == text
 
 
 def test_the_command_of_the_peers_gives_the_figures_of_their_file(tmp_path: Path, repository: Path) -> None:
