@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,15 +51,15 @@ def run_live(options: Live) -> int:
         from taichi_mrf.runs.folder import write_run
         from taichi_mrf.session.session import Session
         from taichi_mrf.session.session_core import Policy
-        from taichi_mrf.session.source import open_source
+        from taichi_mrf.session.source import open_among, open_source
 
         def learn(dataset: "Dataset", config: Config) -> "LearntSigma":
             with ProgressBar(console, options.printing) as progress:
                 return learn_noise(dataset, config, progress, request, options.every, options.limit)
 
-        source, notes = open_source(
-            options.source,
-            settings,
+        open_one = partial(
+            open_source,
+            config=settings,
             every=options.every,
             limit=options.limit,
             speed=options.speed,
@@ -69,6 +70,12 @@ def run_live(options: Live) -> int:
             follow=options.poses.follow,
             learn_noise=learn if options.noise.is_learnt else None,
         )
+        source, notes = open_among(options.source, open_one)
+        if source.among is not None and options.out is not None:
+            raise ConfigError(
+                f"{options.source}: holds several recordings, and --out takes the files of one: pass one of "
+                f"{', '.join(source.among.names[:8])}"
+            )
         for note in notes:
             print_line(note)
         policy = Policy(options.out, options.exit_when_done, options.keep_live)

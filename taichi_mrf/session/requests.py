@@ -50,7 +50,7 @@ class Requests:
         run: Run,
         extras: Extras,
         listening: Callable[[Listening], None],
-        begin_anew: Callable[[], None],
+        begin_anew: Callable[[Reset], None],
     ) -> None:
         self._run = run
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -58,7 +58,7 @@ class Requests:
             Pause: self._pause,
             Step: self._step,
             Speed: self._speed,
-            Reset: lambda request: begin_anew(),
+            Reset: begin_anew,
             Switch: lambda request: self._edit(request, lambda m: m.switch(request.keyframe, request.on)),
             Move: lambda request: self._edit(
                 request, lambda m: m.move(request.keyframe, request.T_world_camera)

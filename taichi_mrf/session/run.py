@@ -136,16 +136,14 @@ class Run(SessionCore):
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
         """Makes the map. Raises TaichiMRFError."""
         super().__init__(link, policy)
-        self.source = source
         self.version = 0
         self.full: str | None = None
         self.replay: Replay | None = None
-        self.begin(first_id=0)
+        self.begin(source, first_id=0)
 
-    def begin(self, first_id: int) -> None:
-        """Drop the map, if there is one, and start the source from its beginning, at the present speed. The
+    def begin(self, source: Source, first_id: int) -> None:
+        """Drop the map, if there is one, and start a source from its beginning, at the present speed. The
         viewer's numbers of keyframes begin at ``first_id``. If it raises, the old map stays."""
-        source = self.source
         m = source.new_map()
         window = window_of(m)
         if window is not None and self.policy.out is not None:
@@ -163,7 +161,7 @@ class Run(SessionCore):
         replay = source.new_replay() if source.new_replay else None
         if replay is not None and self.replay is not None:
             replay.set_speed(self.replay.speed)
-        self.intake, self.replay = intake, replay
+        self.source, self.intake, self.replay = source, intake, replay
         self.mapper = Mapper(intake.map, first_id, intake.refiner, source.own)
         self.follower = follower_of(m, source.dataset, source.config.poses)
         intake.result.followed = None if self.follower is None else self.follower.done
@@ -174,7 +172,7 @@ class Run(SessionCore):
 
     def send_everything(self) -> None:
         """Send a viewer that has just started the whole state."""
-        m = self.mapper.map
+        m, among = self.mapper.map, self.source.among
         self.send(
             replace(
                 self.mapper.hello(self.source.name),
@@ -185,6 +183,8 @@ class Run(SessionCore):
                 has_surface=measures_surface(m),
                 counts_keyframes=has_messages(m),
                 has_frames=self.source.new_replay is not None,
+                recordings=() if among is None else among.names,
+                recording=self.source.place,
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:

@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Callable, Generator
 
-from taichi_mrf.errors import CapacityError
+from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S
@@ -34,9 +34,9 @@ from taichi_mrf.session.mapper import LiveKeyframe
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.requests import Requests, resumes_replay
 from taichi_mrf.session.run import Run, sweeping
-from taichi_mrf.session.session_core import EDITS, Policy
+from taichi_mrf.session.session_core import EDITS, OF_ONE_KEYFRAME, Policy
 from taichi_mrf.session.source import Source
-from taichi_mrf.viewer.messages import Listening, Notice, Request
+from taichi_mrf.viewer.messages import Listening, Notice, Request, Reset
 
 REQUEST_SECONDS = 0.25
 """While frames arrive, the longest time for requests before the next frame is taken, in seconds, so that many
@@ -85,9 +85,19 @@ class Session:
         self.state.send_everything()
         self._extras.start_again_for_viewer()
 
-    def _begin_anew(self) -> None:
-        self.state.begin(self.state.mapper.roster.next_id)
+    def _begin_anew(self, reset: Reset) -> None:
+        """Start the source again, or another one of those that it was chosen among."""
+        state, notes = self.state, list[str]()
+        source, among = state.source, state.source.among
+        if reset.recording is not None:
+            if among is None:
+                raise ConfigError(f"{source.name}: there are no other recordings to choose from")
+            state.show_activity("opening another recording", 0.0)
+            source, notes = among.open(reset.recording)
+        state.begin(source, state.mapper.roster.next_id)
         self._extras.start_over()
+        for note in notes:
+            state.send(Notice(note))
 
     def _carry_out_waiting(self) -> None:
         """Carry out what has been asked for; signals are looked at between any two requests."""
@@ -293,8 +303,8 @@ class Session:
         return go_on
 
     def _may_carry_out(self, request: Request) -> bool:
-        """Edits of a map from a file wait for its messages, which only full inference brings."""
-        return not (self.state.mapper.lacks_messages and isinstance(request, EDITS))
+        """Edits of keyframes of a map from a file wait for its messages, which only full inference brings."""
+        return not (self.state.mapper.lacks_messages and isinstance(request, OF_ONE_KEYFRAME))
 
 
 class _ShowingMover:

@@ -1,7 +1,7 @@
 """Source of a live run: a recording or a camera with a new map, or a saved map."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,10 +14,11 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.entries import holds_frames
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.registry import format_name, recognise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.methods.map_file import open_map_file, read_header
@@ -27,10 +28,13 @@ from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.system import runtime
-from taichi_mrf.system.files import is_file
+from taichi_mrf.system.files import is_file, is_folder
 
 LearnNoise = Callable[[Dataset, Config], LearntSigma]
 """Learns sigma from a recording that is to be mapped with some parameters."""
+
+DEEP = 2
+"""Recordings are looked for in a folder and in the folders in it: so many levels."""
 
 
 def saved_unsettled(name: str) -> str:
@@ -46,7 +50,8 @@ class Source:
     """How to make the map (an empty one, or one from a file), and how to replay the frames, which a saved map
     does not have. ``tracked``: the poses of the frames are found by tracking. ``dataset`` is the recording,
     to check the map against its held-out frames; ``choice`` are the flags that chose its frames. ``learnt``:
-    how sigma was learnt from it, if it was. ``own``: the map is another program's, which changes it."""
+    how sigma was learnt from it, if it was. ``own``: the map is another program's, which changes it.
+    ``among``: what can be opened instead, with this source at ``place``."""
 
     name: str
     config: Config
@@ -57,6 +62,8 @@ class Source:
     choice: dict[str, Any] = field(default_factory=dict)
     learnt: LearntSigma | None = None
     own: bool = False
+    among: "Recordings | None" = None
+    place: int = 0
 
     @property
     def hold_out(self) -> int:
@@ -64,6 +71,77 @@ class Source:
         if self.dataset is None:
             return self.config.evaluation.hold_out
         return hold_out_of(self.dataset, self.config)
+
+
+Opened = tuple[Source, list[str]]
+"""A source that is open, and notes for the user."""
+
+
+class Recordings:
+    """The recordings and saved maps in a folder, which is none itself. ``names`` are their paths below it.
+    Whoever chooses gives a place in this list, never a path."""
+
+    def __init__(self, folder: str, names: tuple[str, ...], open_one: Callable[[str], Opened]) -> None:
+        self.names, self._folder, self._open_one = names, Path(folder), open_one
+
+    def open(self, place: int) -> Opened:
+        """Open the one at a place. Raises ConfigError if there is none there, and what ``open_one`` does."""
+        if not 0 <= place < len(self.names):
+            raise ConfigError(f"{self._folder}: holds {len(self.names)} recordings, and none at {place}")
+        source, notes = self._open_one(str(self._folder / self.names[place]))
+        return dataclasses.replace(source, among=self, place=place), notes
+
+
+def open_among(name: str, open_one: Callable[[str], Opened]) -> Opened:
+    """Open a source; of a folder that is none but holds several, the first that can be opened, with the
+    others to choose from. Raises what ``open_one`` does for the source itself."""
+    recordings = Recordings(name, recordings_in(Path(name)), open_one)
+    problems: list[str] = []
+    for place, taken in enumerate(recordings.names if len(recordings.names) > 1 else ()):
+        try:
+            source, notes = recordings.open(place)
+        except (DatasetError, MapFileError) as error:
+            problems.append(str(error))
+            continue
+        several = f"{name} holds {len(recordings.names)} recordings: this is {taken}, the page has the others"
+        return source, [*problems, several, *notes]
+    return open_one(name)
+
+
+def recordings_in(folder: Path) -> tuple[str, ...]:
+    """The recordings and saved maps in a folder, by their paths below it; none if it is a recording itself.
+    What a link outside the folder leads to is not in it."""
+    if not is_folder(folder) or format_name(folder) != "unknown":
+        return ()
+    return tuple(path.relative_to(folder).as_posix() for path in _found_in(folder, folder.resolve(), DEEP))
+
+
+def _found_in(folder: Path, top: Path, levels: int) -> Iterator[Path]:
+    try:
+        children = sorted(child for child in folder.iterdir() if not child.name.startswith((".", "__")))
+    except OSError:  # a folder that may not be read
+        return
+    for child in children:
+        if not child.resolve().is_relative_to(top):
+            continue
+        if recognise(child) is not None or _is_readable_map(child):
+            yield child
+        elif is_folder(child) and levels > 1:
+            yield from _found_in(child, top, levels - 1)
+
+
+def _is_map(path: Path) -> bool:
+    return path.suffix == ".npz" and is_file(path) and not holds_frames(path)
+
+
+def _is_readable_map(path: Path) -> bool:
+    try:
+        if _is_map(path):
+            with open_map_file(path):
+                return True
+    except TaichiMRFError:  # arrays of something else
+        pass
+    return False
 
 
 def open_source(
@@ -79,7 +157,7 @@ def open_source(
     poses: str | None = None,
     follow: bool = False,
     learn_noise: LearnNoise | None = None,
-) -> tuple[Source, list[str]]:
+) -> Opened:
     """Start Taichi and open a source, read as ``reading`` says; returns it with notes for the user. With
     ``track`` the poses of its frames are found by tracking, with ``poses`` they come from that file, and
     ``follow`` it as it changes. ``learn_noise`` learns sigma before a recording is mapped.
@@ -88,7 +166,7 @@ def open_source(
     """
     runtime.init(config.runtime.arch, config.runtime.threads)
     path = Path(name)
-    if path.suffix == ".npz" and is_file(path) and not holds_frames(path):
+    if _is_map(path):
         if poses is not None:
             raise ConfigError(
                 f"{path}: is a saved map, whose keyframes have poses: --poses is for a recording"

@@ -67,6 +67,9 @@ class Hello(Update):
     """True if the map knows how many keyframes see a voxel."""
     has_frames: bool = True
     """True if the map is made from frames, and is not one from a file."""
+    recordings: tuple[str, ...] = ()
+    """Names of all that can be mapped instead, with ``recording``, the place of the source among them."""
+    recording: int = 0
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ class KeyframeInfo(Update):
     ``picture`` is a small depth image in colours, (h, w, 3) uint8. If ``camera`` is no pinhole, it is that of
     the picture's pixels; ``crossed`` (n, 3) int32 are the bricks
     that its rays cross, which are free where the map has no voxels. ``T_home`` is the pose that *Put back*
-    restores; None means the pose of the first message about this keyframe.
+    restores.
     """
 
     id: int
@@ -150,7 +153,7 @@ class KeyframeInfo(Update):
     state: KeyframeState
     picture: NDArray[np.uint8]
     crossed: NDArray[np.int32]
-    T_home: Pose | None = None
+    T_home: Pose
 
 
 @dataclass(frozen=True)
@@ -328,7 +331,9 @@ class Speed(Request):
 
 @dataclass(frozen=True)
 class Reset(Request):
-    """Delete the map and start the source again."""
+    """Delete the map and start again: the same source, or the ``recording`` at this place of Hello's."""
+
+    recording: int | None = None
 
 
 @dataclass(frozen=True)

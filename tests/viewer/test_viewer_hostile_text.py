@@ -73,8 +73,18 @@ CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 ONE = np.ones(1, np.float32)
 LIVE_UPDATES: tuple[m.Update, ...] = (
-    m.Hello(HOSTILE, HOSTILE, HOSTILE, HOSTILE, 0.1, -2.0, 0.1, f"voxel_size: 0.1\n{HOSTILE}"),
-    m.KeyframeInfo(0, HOSTILE, np.eye(4), CAMERA, 1, "on", PICTURE, np.zeros((0, 3), np.int32)),
+    m.Hello(
+        HOSTILE,
+        HOSTILE,
+        HOSTILE,
+        HOSTILE,
+        0.1,
+        -2.0,
+        0.1,
+        f"voxel_size: 0.1\n{HOSTILE}",
+        recordings=(HOSTILE, "b"),
+    ),
+    m.KeyframeInfo(0, HOSTILE, np.eye(4), CAMERA, 1, "on", PICTURE, np.zeros((0, 3), np.int32), np.eye(4)),
     m.CurrentCamera(HOSTILE, np.eye(4), CAMERA),
     m.Status(HOSTILE, 0.5, 1, 2, 1, 0, 1.0, 1, 1, 1.0, False, False, False),
     m.Notice(HOSTILE, "error"),

@@ -156,9 +156,8 @@ CAMERA = PinholeCamera(64, 48, 50.0, 55.0, 30.0, 25.0)
 
 
 def keyframe(id: int, T_world_camera: np.ndarray, camera: Camera = CAMERA) -> KeyframeInfo:
-    return KeyframeInfo(
-        id, "k", T_world_camera, camera, 1, "on", np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
-    )
+    picture, crossed = np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
+    return KeyframeInfo(id, "k", T_world_camera, camera, 1, "on", picture, crossed, T_world_camera)
 
 
 def test_a_click_on_a_picture_finds_its_pixel() -> None:

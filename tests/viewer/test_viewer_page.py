@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import viser
 from handled_page import HandledPage
-from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
+from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
 
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import COMMANDS, SWITCHES, Dragged
-from taichi_mrf.viewer.scene.base_panel import Joined
+from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, SWITCHES, Dragged
+from taichi_mrf.viewer.scene.base_panel import Joined, Used
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.transport import downloads
 
@@ -29,7 +29,7 @@ def keyframe(id: int, x: float = 0.0, state: m.KeyframeState = "on") -> m.Keyfra
     T = np.eye(4)
     T[0, 3] = x
     picture, crossed = np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
-    return m.KeyframeInfo(id, f"frame {id}", T, CAMERA, 1, state, picture, crossed)
+    return m.KeyframeInfo(id, f"frame {id}", T, CAMERA, 1, state, picture, crossed, T)
 
 
 class LivePage(HandledPage):
@@ -219,11 +219,11 @@ def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClien
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     question = browser.hear_type("GuiModalMessage")["uuid"]
     assert handled.asked == []
-    handled.act("Keep the map", client)
+    handled.act(DECLINE, client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     assert handled.asked == []
     handled.act("Reset", client)
-    handled.act("Delete the map and start again", client)
+    handled.act(AGREE, client)
     assert handled.asked == [m.Reset()]
 
 
@@ -231,14 +231,14 @@ def test_freeze_asks_before_it_acts(handled: LivePage, browser: RawClient) -> No
     client = handled.client_id()
     handled.act("Freeze", client)
     question = browser.hear_type("GuiModalMessage")["uuid"]
-    handled.act("Keep the map", client)
+    handled.act(DECLINE, client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
-    handled.act("Freeze it", client + 1)  # of one that was not asked
+    handled.act(AGREE, client + 1)  # of one that was not asked
     assert handled.asked == []
     handled.act("Freeze", client)
     handled.take(keyframe(1))
     handled.page._choose(1)  # another browser chooses another one meanwhile
-    handled.act("Freeze it", client)
+    handled.act(AGREE, client)
     assert handled.asked == [m.Freeze(0)]
 
 
@@ -246,6 +246,61 @@ def test_an_empty_map_is_reset_at_once(handled: LivePage, browser: RawClient) ->
     handled.take(HELLO)
     handled.act("Reset", handled.client_id())
     assert handled.asked == [m.Reset()]
+
+
+SEVERAL = replace(HELLO, recordings=("a", "b/map.npz"), recording=1)
+
+
+def test_recordings_are_offered_if_there_are_several(handled: LivePage) -> None:
+    recording = handled.page.panel.recording
+    assert not recording.visible
+    handled.take(SEVERAL)
+    assert (recording.visible, recording.options, recording.value) == (True, ("a", "b/map.npz"), "b/map.npz")
+
+
+def test_another_recording_is_mapped_after_a_question_if_something_is_unsaved(
+    handled: LivePage, browser: RawClient
+) -> None:
+    client, recording = handled.client_id(), handled.page.panel.recording
+    handled.take(SEVERAL)
+
+    def choose() -> None:
+        recording.value = "a"
+        handled.act("Recording", client)
+        assert recording.value == "b/map.npz", "it is mapped still"
+
+    handled.act("Recording", client)
+    assert handled.asked == [], "it is mapped already"
+    choose()
+    assert handled.asked == [m.Reset(0)]
+    handled.take(keyframe(2))
+    choose()
+    question = browser.hear_type("GuiModalMessage")["uuid"]
+    handled.act(DECLINE, client)
+    browser.hear_type("GuiCloseModalMessage", uuid=question)
+    assert handled.asked == [m.Reset(0)]
+    choose()
+    handled.act(AGREE, client)
+    assert handled.asked == [m.Reset(0), m.Reset(0)]
+    handled.take(replace(SEVERAL, recording=0))
+    assert recording.value == "a"
+
+
+def test_no_client_can_name_a_recording_that_is_not_offered(handled: LivePage, browser: RawClient) -> None:
+    recording, inbox = handled.page.panel.recording, handled.page.inbox
+    handled.client_id()
+    browser.say(widget_message(recording._impl.uuid, ""))  # it is hidden
+    handled.take(SEVERAL)
+    for value in ("", "/etc", "../a", "a/../../..", "A", "b", 0, -1, 7, None, ["a"], {"a": 0}, True):
+        browser.say(widget_message(recording._impl.uuid, value))
+    browser.say({"type": "GuiUpdateMessage", "uuid": recording._impl.uuid, "updates": {"options": ["/etc"]}})
+    browser.say(widget_message(recording._impl.uuid, "a"))
+    wait_for(lambda: recording.value == "a", "the one that is offered")
+    handled.server._thread_executor.submit(lambda: None).result()
+    wait_for(lambda: inbox.qsize() > 0, "its event")
+    used = [item for item in inbox.wait(0.0) if isinstance(item, Used)]
+    assert [each.action for each in used] == ["Recording"]
+    assert recording.options == ("a", "b/map.npz")
 
 
 def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import get_args
 
 import numpy as np
 import viser
@@ -12,7 +11,9 @@ from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.panel import (
+    AGREE,
     CHOSEN_KEYFRAME,
+    DECLINE,
     POSITION_STEP_M,
     SPEEDS,
     SWITCHES,
@@ -25,8 +26,8 @@ from taichi_mrf.viewer.live.panel import (
     facts_of,
     facts_of_many,
 )
-from taichi_mrf.viewer.scene.base_page import BasePage
-from taichi_mrf.viewer.scene.base_panel import POP_UP_S, Inbox
+from taichi_mrf.viewer.scene.base_page import POP_UP_S, BasePage
+from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
 from taichi_mrf.viewer.scene.viewpoint import Side
@@ -84,22 +85,20 @@ class Page(BasePage[Panel]):
             "Pause": lambda client: ask(m.Pause(True)),
             "Step": lambda client: ask(m.Step()),
             "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
-            **{side.capitalize(): partial(self._look_from, side) for side in get_args(Side)},
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
-            "Delete the map and start again": self.panel.agree,
             "Undo": lambda client: self._redo(back=True),
             "Redo": lambda client: self._redo(),
-            "Keep the map": self.panel.close_question,
-            "Leave it as it is": self.panel.close_question,
+            "Recording": self._choose_recording,
+            AGREE: self.panel.agree,
+            DECLINE: self.panel.close_question,
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
             "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
             "All off": lambda client: self._switch_range(False),
             "All on": lambda client: self._switch_range(True),
             "Freeze": self._freeze,
-            "Freeze it": self.panel.agree,
             "Move": lambda client: self._toggle_gizmo(),
-            "Put back": lambda client: self._edit(self._move_home),
+            "Put back": lambda client: self._edit(lambda k: m.Move(k.id, k.T_home)),
             "Position (m)": lambda client: self._edit(self._move_as_typed),
             "Show the ray": lambda client: self._edit(lambda k: m.PixelRay(k.id, *self.panel.pixel.value)),
             "Show images": lambda client: self._watch_images(),
@@ -126,13 +125,11 @@ class Page(BasePage[Panel]):
         if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
 
-    def _look_from(self, side: Side, client: int) -> None:
+    def look_from(self, side: Side, client: int) -> None:
         """Show the whole map to one client, and follow the camera no more."""
         self.panel.set_following(False)
         self._take_options()
-        box = None if self.map is None else self.map.box_m()
-        if box is not None:
-            self.viewpoint.look_from(client, side, *box)
+        super().look_from(side, client)
 
     def _begin(self, hello: m.Hello) -> None:
         """Start with an empty map."""
@@ -219,33 +216,55 @@ class Page(BasePage[Panel]):
 
     def _reset(self, client: int) -> None:
         """Ask before a map with keyframes is deleted."""
-        handle = self.server.get_clients().get(client)
-        if handle is None or not self.keyframes.keyframes:
-            self.ask(m.Reset())
-        else:
-            self.panel.ask(
-                handle,
-                "Reset the map?",
-                "This deletes the map and all edits of its keyframes, and maps the source again from its "
-                "first frame. To keep the map, save it first.",
-                "Delete the map and start again",
+        self._request(
+            client,
+            m.Reset(),
+            bool(self.keyframes.keyframes),
+            "Reset the map?",
+            "This deletes the map and all edits of its keyframes, and maps the source again from its first "
+            "frame. To keep the map, save it first.",
+            "Delete the map and start again",
+            "Keep the map",
+        )
+
+    def _choose_recording(self, client: int) -> None:
+        """Ask before changes are lost with the map. The dropdown shows what is mapped, until a Hello says
+        that it is another one."""
+        chosen = self.panel.recording.value
+        self.panel.show_recording(self._hello)
+        if chosen != self.panel.recording.value:
+            self._request(
+                client,
+                m.Reset(self._hello.recordings.index(chosen)),
+                self.panel.unsaved.visible,
+                "Discard changes?",
+                "The map has changes that are not saved; a map of another recording takes its place.",
+                "Discard them",
                 "Keep the map",
-                lambda: self.ask(m.Reset()),
             )
 
     def _freeze(self, client: int) -> None:
         """Ask before the chosen keyframe is frozen."""
-        handle, chosen = self.server.get_clients().get(client), self._changeable()
-        if handle is not None and chosen is not None:
-            self.panel.ask(
-                handle,
+        chosen = self._changeable()
+        if chosen is not None:
+            self._request(
+                client,
+                m.Freeze(chosen.id),
+                True,
                 "Freeze the keyframe?",
                 f"This makes the evidence of keyframe {chosen.id} ({in_markdown(chosen.name)}) permanent and "
                 "drops its image: it can never be switched off, moved or looked at again.",
                 "Freeze it",
                 "Leave it as it is",
-                lambda: self.ask(m.Freeze(chosen.id)) if chosen.id in self.keyframes.keyframes else None,
             )
+
+    def _request(self, client: int, request: m.Request, asks: bool, *question: str) -> None:
+        """Send a request; if it ``asks``, once its user has agreed to a question: title, text, yes, no."""
+        handle = self.server.get_clients().get(client)
+        if not asks:
+            self.ask(request)
+        elif handle is not None:
+            self.panel.ask(handle, lambda: self.ask(request), *question)
 
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)
@@ -315,9 +334,6 @@ class Page(BasePage[Panel]):
         frozen = info and f"Keyframe {info.id} ({info.name}) is frozen: it cannot be changed."
         self.notify(m.Notice(frozen or "There is no keyframe yet.", "warning"))
         return None
-
-    def _move_home(self, keyframe: m.KeyframeInfo) -> m.Request:
-        return m.Move(keyframe.id, self.keyframes.roster.recorded[keyframe.id])
 
     def _move_as_typed(self, keyframe: m.KeyframeInfo) -> m.Request:
         """The boxes hold rounded numbers; only a coordinate that differs by more than the rounding moves."""

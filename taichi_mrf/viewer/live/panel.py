@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.coloring import LOOKS, LookName, ViewOptions
+from taichi_mrf.viewer.scene.keyframe_layer import draw_lines
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
@@ -79,6 +80,8 @@ SAVE_BUTTONS = {
     "Recording (.viser)": "Start recording the scene; press again to get the file.",
 }
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
+AGREE, DECLINE = "agree", "decline"
+"""Actions of the answers to a question."""
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
@@ -97,6 +100,8 @@ class Panel(BasePanel):
         self._names: dict[str, int] = {}
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
+        hint = "Map another one of the folder; what is not saved is lost, after a question."
+        self.recording = self.watch(gui.add_dropdown("Recording", [""], visible=False, hint=hint))
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
         self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
@@ -141,6 +146,7 @@ class Panel(BasePanel):
     def show_hello(self, hello: m.Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
+        self.show_recording(hello)
         self.time.begin(hello.has_dates)
         self.view_options.offer("look", _looks_of(hello))
         self._parameters.content = (
@@ -148,14 +154,17 @@ class Panel(BasePanel):
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
         )
         self._edits.options = tuple(label for label in EDIT_BUTTONS if hello.can_freeze or label != "Freeze")
-        self._offer_replay(hello.has_frames)
+        # A map from a file has no frames to come, and none that have come: it can only be opened anew.
+        self._run.options = RUN_BUTTONS if hello.has_frames else ("Reset",)
+        self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if hello.has_frames else (CHOSEN_KEYFRAME,)
+        self.view_options.handles["follow"].visible = hello.has_frames
         self.clear_notices()
 
-    def _offer_replay(self, has_frames: bool) -> None:
-        """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
-        self._run.options = RUN_BUTTONS if has_frames else ("Reset",)
-        self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
-        self.view_options.handles["follow"].visible = has_frames
+    def show_recording(self, hello: m.Hello) -> None:
+        """Offer the recordings that can be mapped, if there are several, and show which one is."""
+        if hello.recordings:
+            names, place = hello.recordings, hello.recording
+            change(self.recording, options=names, value=names[place], visible=True)
 
     def show_history(self, can_undo: bool, can_redo: bool) -> None:
         """Offer to take edits back, and to make them again, if there are any."""
@@ -239,7 +248,7 @@ class Panel(BasePanel):
         self._score.content = f"**{in_markdown(title)}**\n\n{in_markdown(score)}" if title else ""
 
     def ask(
-        self, client: viser.ClientHandle, title: str, text: str, yes: str, no: str, then: Callable[[], None]
+        self, client: viser.ClientHandle, then: Callable[[], None], title: str, text: str, yes: str, no: str
     ) -> None:
         """Ask one user to confirm what cannot be undone, which ``then`` does. The answers are actions, for
         :meth:`agree` and :meth:`close_question`."""
@@ -248,8 +257,8 @@ class Panel(BasePanel):
         self._questions[client.client_id] = modal, then
         with modal:
             client.gui.add_markdown(text)
-            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, yes))
-            client.gui.add_button(no).on_click(lambda event: self.used(event, no))
+            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, AGREE))
+            client.gui.add_button(no).on_click(lambda event: self.used(event, DECLINE))
 
     def close_question(self, client: int) -> None:
         """Close the question."""
@@ -414,13 +423,7 @@ class VoxelAnswer:
         if before is not None and before != point:
             ends = np.array([before, point])
             self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
-            self._scene.add_line_segments(
-                "/distance",
-                ends[None].astype(np.float32),
-                _LINE_COLOR,
-                thickness=2.0,
-                thickness_units="screen",
-            )
+            draw_lines(self._scene, "/distance", ends[None], _LINE_COLOR)
 
     def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
         """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest

@@ -11,8 +11,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import numpy as np
 import viser
@@ -20,11 +21,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used, pop_up
+from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used
 from taichi_mrf.viewer.scene.coloring import SPACE, Scale, ViewOptions, key_html, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
-from taichi_mrf.viewer.scene.viewpoint import ViewpointController
+from taichi_mrf.viewer.scene.viewpoint import Side, ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
 from taichi_mrf.viewer.transport.pulse import Pulse
 from taichi_mrf.viewer.transport.server import start_server
@@ -34,6 +35,14 @@ P = TypeVar("P", bound=BasePanel)
 _HEAD_START_S = 0.01
 """Delay that lets the new count reach the browser before the voxel data: a browser that draws by software is
 busy with the voxels for half a second."""
+
+_POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
+    "info": "blue",
+    "warning": "yellow",
+    "error": "red",
+}
+POP_UP_S = 8.0
+_LONGEST_POP_UP = 500
 
 _TOP, _BOTTOM, _BACKDROP_ROWS = (52, 58, 68), (104, 112, 124), 256
 
@@ -59,7 +68,10 @@ class BasePage(Generic[P]):
         self.map: MapScene | None = None
         self._explained: tuple[Scale | None, ViewOptions] | None = None  # by the legend
         self._with_baseline = False
-        self.actions: dict[str, Callable[[int], None]] = {BasePanel.DARK_OR_LIGHT[0]: self._turn_colors}
+        self.actions: dict[str, Callable[[int], None]] = {
+            BasePanel.DARK_OR_LIGHT[0]: self._turn_colors,
+            **{side.capitalize(): partial(self.look_from, side) for side in get_args(Side)},
+        }
         """Function of each action, given the client that asked for it."""
         self.handlers: dict[type, Callable[[Any], None]] = {
             m.Notice: self.notify,
@@ -102,10 +114,19 @@ class BasePage(Generic[P]):
             self.map.clear()
         self.map = MapScene(self.server, hello)
 
+    def look_from(self, side: Side, client: int) -> None:
+        """Show the whole map to one client."""
+        box = None if self.map is None else self.map.box_m()
+        if box is not None:
+            self.viewpoint.look_from(client, side, *box)
+
     def notify(self, notice: m.Notice) -> None:
-        """Show a notice in the list and over the page."""
+        """Show a notice in the list, and for some seconds in every browser."""
         self.panel.show_notice(notice)
-        pop_up(self.server, notice)
+        title = "Something went wrong" if notice.severity == "error" else "Note"
+        text, color = notice.text[:_LONGEST_POP_UP], _POP_UP_COLORS[notice.severity]
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=POP_UP_S, color=color)
 
     def show_counts(self) -> None:
         """Show how much of what the page shows, or will show in a moment."""

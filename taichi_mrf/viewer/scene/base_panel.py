@@ -8,7 +8,7 @@ thread takes them out. viser runs callbacks on a pool of threads: a callback onl
 import queue
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import viser
@@ -77,13 +77,6 @@ _INSTEAD = {"triangles": "triangles of the measured surface", "points": "measure
 """Layers that are shown in the place of voxels, and their words."""
 
 _SEVERITY_COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
-_POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
-    "info": "blue",
-    "warning": "yellow",
-    "error": "red",
-}
-POP_UP_S = 8.0
-_LONGEST_POP_UP = 500
 
 
 class BasePanel:
@@ -203,12 +196,3 @@ def notices_html(notices: Iterable[Notice]) -> str:
         for each in notices
     )
     return f'<div style="margin:0.5em 0.75em;font-size:0.85em">{lines}</div>'
-
-
-def pop_up(server: viser.ViserServer, notice: Notice) -> None:
-    """Show a notice for some seconds in every browser."""
-    title = "Something went wrong" if notice.severity == "error" else "Note"
-    color = _POP_UP_COLORS[notice.severity]
-    text = notice.text[:_LONGEST_POP_UP]
-    for client in server.get_clients().values():
-        client.add_notification(title, text, auto_close_seconds=POP_UP_S, color=color)

@@ -4,6 +4,7 @@ keyframe's picture."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import viser
@@ -39,6 +40,15 @@ def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.flo
     return wxyz, T_world_camera[:3, 3]
 
 
+def draw_lines(
+    scene: viser.SceneApi, name: str, lines: ArrayLike, color: Any, thickness: float = 2.0, **place: Any
+) -> None:
+    """Draw lines (n, 2, 3), in metres, as wide on the screen wherever they are; ``color`` is RGB, or one for
+    each end (n, 2, 3)."""
+    points = np.asarray(lines, np.float32)
+    scene.add_line_segments(name, points, color, thickness=thickness, thickness_units="screen", **place)
+
+
 class ShownKeyframes:
     """The keyframes that the page keeps, by number: all that can be changed, and the latest frozen ones. Of
     older frozen keyframes only positions and crossed bricks are kept, so that the memory of an endless run
@@ -46,8 +56,6 @@ class ShownKeyframes:
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}
-        self.recorded: dict[int, Pose] = {}
-        """The pose of each keyframe that *Put back* restores."""
         self._old_way: list[NDArray[np.float64]] = []
         self._old_crossed: list[NDArray[np.int32]] = []
         self._merged = 0
@@ -57,11 +65,6 @@ class ShownKeyframes:
         """Keep a keyframe that is new or has changed; returns the numbers of keyframes that are forgotten for
         it."""
         self.keyframes[keyframe.id] = keyframe
-        home = keyframe.T_home
-        if home is not None:
-            self.recorded[keyframe.id] = home
-        else:
-            self.recorded.setdefault(keyframe.id, keyframe.T_world_camera)
         frozen = [id for id in sorted(self.keyframes) if self.keyframes[id].state == "frozen"]
         forgotten = frozen[: max(0, len(frozen) - MOST_FROZEN)]
         for id in forgotten:
@@ -80,7 +83,6 @@ class ShownKeyframes:
 
     def _forget(self, id: int) -> None:
         keyframe = self.keyframes.pop(id)
-        del self.recorded[id]
         self._old_crossed.append(keyframe.crossed)
         # Merged only when they have doubled, so that each brick is sorted a few times at most.
         if sum(map(len, self._old_crossed)) > max(2 * self._merged, LEAST_TO_MERGE):
@@ -146,8 +148,7 @@ class KeyframeLayer:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
         points = self.roster.way_m()
         if len(points) > 1:
-            segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-            self._scene.add_line_segments("/way", segments, _WAY, thickness=2.0, thickness_units="screen")
+            draw_lines(self._scene, "/way", np.stack([points[:-1], points[1:]], axis=1), _WAY)
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
@@ -234,15 +235,8 @@ class KeyframeLayer:
         """Draw a frustum, or what a camera without a flat image sees on a sphere: rings."""
         wxyz, position = placement(T_world_camera)
         if not isinstance(camera, PinholeCamera):
-            self._scene.add_line_segments(
-                name,
-                border(camera, enlarged * RING_M),
-                color,
-                thickness=thickness,
-                thickness_units="screen",
-                wxyz=wxyz,
-                position=position,
-            )
+            rings = border(camera, enlarged * RING_M)
+            draw_lines(self._scene, name, rings, color, thickness, wxyz=wxyz, position=position)
             return
         fov, aspect = _view_angles(camera)
         self._scene.add_camera_frustum(

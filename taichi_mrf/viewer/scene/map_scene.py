@@ -16,7 +16,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer, MeasuredPoints, SceneChange
 from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, Scale, Show, ViewOptions
-from taichi_mrf.viewer.scene.keyframe_layer import placement
+from taichi_mrf.viewer.scene.keyframe_layer import draw_lines, placement
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
@@ -233,13 +233,8 @@ class MapScene:
         edges = brick_edges(np.zeros((1, 3), np.int64)) - 0.5
         lines = [np.array(each.centre_m) + edges * each.size_m for each in self.changes]
         colors = np.repeat([CHANGE_COLORS[each.verb] for each in self.changes], len(edges), axis=0)
-        scene.add_line_segments(
-            "/changes",
-            np.concatenate(lines).astype(np.float32),
-            np.repeat(colors[:, None], 2, axis=1).astype(np.uint8),
-            thickness=2.0,
-            thickness_units="screen",
-        )
+        ends = np.repeat(colors[:, None], 2, axis=1).astype(np.uint8)
+        draw_lines(scene, "/changes", np.concatenate(lines), ends)
 
     def _show_space(self, options: ViewOptions, up: Up) -> None:
         """Show the axes, and the ground under the map while that has the same box."""
@@ -267,10 +262,8 @@ class MapScene:
         if not wanted or not len(bricks):
             self._server.scene.remove_by_name("/bricks")
             return
-        lines = (brick_edges(bricks) * BRICK * self._hello.voxel_size).astype(np.float32)
-        self._server.scene.add_line_segments(
-            "/bricks", lines, _OUTLINE_COLOR, thickness=1.0, thickness_units="screen"
-        )
+        lines = brick_edges(bricks) * BRICK * self._hello.voxel_size
+        draw_lines(self._server.scene, "/bricks", lines, _OUTLINE_COLOR, thickness=1.0)
 
     def _draw_names(self, up: Up) -> None:
         """Put a label above each map if there are two."""

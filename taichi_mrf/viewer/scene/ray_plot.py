@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from taichi_mrf.viewer.messages import RayAnswer
+from taichi_mrf.viewer.scene.keyframe_layer import draw_lines
 from taichi_mrf.viewer.scene.widgets import in_markdown
 
 Curves = tuple[NDArray[np.float64], ...]
@@ -50,13 +51,7 @@ class RayPlot:
         self._text.content = f"**{in_markdown(answer.title)}**\n\n{in_markdown(_sentence(answer))}"
         start = np.array(answer.origin)
         end = start + np.array(answer.direction) * _end_m(answer)
-        self._scene.add_line_segments(
-            "/ray",
-            np.array([[start, end]], np.float32),
-            (230, 0, 126),
-            thickness=3.0,
-            thickness_units="screen",
-        )
+        draw_lines(self._scene, "/ray", [[start, end]], (230, 0, 126), thickness=3.0)
 
     def clear(self) -> None:
         """Hide the plot and the ray."""

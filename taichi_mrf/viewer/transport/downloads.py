@@ -65,11 +65,8 @@ class Downloads:
         """Give a browser the scene as one HTML file."""
         if self._begin(client, "page"):
             scene = self._server.get_scene_serializer()
-            self._pool.submit(
-                self._finish,
-                client,
-                "page",
-                lambda: self.send(client, "map.html", standalone_page(scene).encode()),
+            self._later(
+                client, "page", lambda: self.send(client, "map.html", standalone_page(scene).encode())
             )
 
     def toggle_recording(self, client: int) -> None:

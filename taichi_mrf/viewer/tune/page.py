@@ -5,8 +5,6 @@ only its own parameter.
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import get_args
 
 import viser
 
@@ -17,7 +15,6 @@ from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
-from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.panel import KnobMoved, TunePanel
 
@@ -54,7 +51,6 @@ class TunePage(BasePage[TunePanel]):
             KnobMoved: lambda moved: self._knob_moved(moved.name),
         }
         self.actions |= {
-            **{side.capitalize(): partial(self._look_from, side) for side in get_args(Side)},
             "Start a search": lambda client: ask(self.panel.search.value()),
             "Save best.yaml": lambda client: ask(t.SaveTries("best", 0, client)),
             "Stop the search": lambda client: ask(t.StopSearch()),
@@ -109,11 +105,6 @@ class TunePage(BasePage[TunePanel]):
         self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
         self.viewpoint.camera_moved(keyframe.T_world_camera, forwards(keyframe.camera))
         self.viewpoint.set_following(True)
-
-    def _look_from(self, side: Side, client: int) -> None:
-        box = None if self.map is None else self.map.box_m()
-        if box is not None:
-            self.viewpoint.look_from(client, side, *box)
 
     def _take_activity(self, activity: t.Activity) -> None:
         self.panel.show_tuning_activity(activity)

@@ -1,0 +1,64 @@
+"""Another recording of a folder, chosen on the page in a real Chromium."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import LivePage, chromium, missing
+from live_program import LiveProgram
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.system import runtime
+
+pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
+
+FAR_M = 40.0
+"""Distance between the two recordings' rooms."""
+
+
+def write_recording(folder: Path, count: int, x_m: float) -> None:
+    """Some frames of the built-in room, which stands at ``x_m``."""
+    runtime.init("cpu")
+    dataset = open_dataset(f"synthetic:room?frames={count}&width=96&height=72")
+    frames, poses = [dataset.read(i) for i in range(count)], []
+    for frame in frames:
+        poses.append(frame.T_world_camera.copy())
+        poses[-1][0, 3] += x_m
+    camera = frames[0].camera
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    folder.mkdir()
+    depth_m = np.stack([frame.depth_m for frame in frames])
+    np.savez(folder / "frames.npz", depth_m=depth_m, T_world_camera=np.stack(poses), K=K)
+
+
+def test_another_recording_is_mapped_in_the_same_page(tmp_path: Path) -> None:
+    write_recording(tmp_path / "first", 4, 0.0)
+    write_recording(tmp_path / "second", 3, FAR_M)
+    flags = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
+    with (
+        LiveProgram(tmp_path, *flags) as program,
+        chromium() as browser,
+        LivePage(browser, program.address) as page,
+    ):
+        before = page.until_settled()
+        assert len(before.keyframes) == 4
+        assert page.input("Recording").input_value() == "first"
+        assert page.position()[0] < FAR_M / 2
+        page.screenshot("recordings_first")
+        page.select("Recording", "second")
+        page.until(lambda seen: "Discard changes?" in page.text(), "the question")
+        page.screenshot("recordings_question")
+        page.press("Keep the map")
+        page.until(lambda seen: "Discard changes?" not in page.text(), "no question")
+        assert page.input("Recording").input_value() == "first"
+        assert page.look().keyframes == before.keyframes
+        page.select("Recording", "second")
+        page.press("Discard them")
+        page.until(lambda seen: len(seen.keyframes) == 3 and seen.settled, "the other recording")
+        assert page.input("Recording").input_value() == "second"
+        page.until(lambda seen: page.position()[0] > FAR_M / 2, "a view of the other recording")
+        page.screenshot("recordings_second")
+        page.tab("About")
+        seen = page.until(lambda seen: "source" in seen.table, "the figures")
+        assert seen.table["source"] == str(tmp_path / "second")
+        assert page.problems == []
