@@ -135,8 +135,8 @@ def test_normal_probabilities_are_those_of_the_error_function() -> None:
     _normal(low, high, between, tail, density)
     assert (between >= 0).all()
     assert (between[low == high] < 1e-7).all()
-    # Half of what the formula may be wrong for erfc, and two units in the last place of 1/2 for float32: CUDA's
-    # division is no more exact than that.
+    # Half of what the formula may be wrong for erfc, and two units in the last place of 1/2 for float32:
+    # CUDA's division is no more exact than that.
     of_a_tail = 0.75e-7 + 2 * np.spacing(np.float32(0.5))
     assert np.abs(tail - oracle.normal_between(np.abs(low), np.inf)).max() < of_a_tail
     assert np.abs(between - oracle.normal_between(low, high)).max() < 2 * of_a_tail
