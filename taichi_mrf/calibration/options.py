@@ -28,12 +28,11 @@ class BoardConfig:
     """Side of a square in metres, as measured on the print."""
 
     border: float = 0.5
-    """How far the pixels that are used reach beyond the outermost inner corners, in squares. 1 is the edge of
-    the outer squares, where many sensors mix board and background."""
+    """Margin of the pixels in use beyond the outermost inner corners, in squares. 1 is the edge of the outer
+    squares, where many sensors mix board and background."""
 
     largest_reprojection: float = 1.0
-    """Images whose corners lie further than this (pixels, RMS) from where the board's pose puts them are
-    left out."""
+    """Leave out images whose corners have a larger reprojection error than this (pixels, RMS)."""
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):
@@ -51,17 +50,17 @@ class BoardConfig:
 
 @dataclass(frozen=True)
 class MotionCaptureConfig:
-    """How poses of motion capture are put into the time of the images."""
+    """Alignment in time of motion capture and images."""
 
     largest_lag: float = 1.0
-    """The time lag between the two streams is sought up to this many seconds either way."""
+    """Largest time lag between the two streams that is searched, in seconds either way."""
 
     largest_gap: float = 0.05
-    """Largest gap between poses of motion capture (seconds); within a larger one nothing is interpolated."""
+    """Largest gap between poses of motion capture (seconds); larger gaps are not interpolated."""
 
     least_correlation: float = 0.6
-    """Least correlation of the board's speeds in the images with those in motion capture; below it the
-    streams do not belong together."""
+    """Minimum correlation between the board's speeds in the images and in motion capture; below it the two
+    streams are refused."""
 
     def __post_init__(self) -> None:
         _check(self.largest_lag >= 0, "motion_capture.largest_lag", "must not be negative")
@@ -84,31 +83,30 @@ class CalibrationConfig:
     """Nearest depth that the sensor is used at; nearer samples are ignored."""
 
     max_depth: float = 5.0
-    """Furthest depth that the sensor is used at. From the nearest to the furthest sigma is kept positive."""
+    """Furthest depth that the sensor is used at. Sigma is kept positive from min_depth to max_depth."""
 
     bin_width: float = 0.1
     """Width of a depth bin in metres."""
 
     least_count: int = 50
-    """A patch's depth bin with fewer samples than this does not count."""
+    """Minimum number of samples in a patch's depth bin; other bins are ignored."""
 
     least_span: float = 0.5
-    """A patch whose bins span less than this share of what the best covered patches span borrows from its
-    neighbours."""
+    """A patch borrows from its neighbours if its bins span less than this share of the depths that
+    the best covered patches span."""
 
     outlier_sigmas: float = 5.0
     """Samples further than this many robust standard deviations from the median of their patch and bin are
     left out; the map's inference.outlier_floor accounts for these."""
 
     least_sigma: float = 1e-4
-    """Sigma is kept at this many metres or more from min_depth to max_depth. The map itself bounds sigma
-    at 1 mm from below."""
+    """Lower bound on sigma in metres, from min_depth to max_depth. The map itself uses at least 1 mm."""
 
     board: BoardConfig = field(default_factory=BoardConfig)
     """The chessboard, where one is used."""
 
     motion_capture: MotionCaptureConfig = field(default_factory=MotionCaptureConfig)
-    """How motion capture is used, where it is."""
+    """Motion capture, where it is used."""
 
     def __post_init__(self) -> None:
         _check(self.patch >= 1, "patch", "must be at least 1 pixel")

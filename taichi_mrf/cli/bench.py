@@ -122,7 +122,7 @@ def _ratios_in(path: Path, options: Bench) -> dict[tuple[float, str], float]:
     """The ratios in a file of ``--json``, by voxel size and name. Raises ConfigError, before anything is
     measured, if they cannot be compared with those of a run with the options."""
     if not octomap_available():
-        raise ConfigError("--gate compares with OctoMap: pip install 'taichi-mrf[bench]' brings it")
+        raise ConfigError("--gate needs OctoMap: pip install 'taichi-mrf[bench]'")
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
         rows = {row["voxel_size"]: row for row in report["rows"]}

@@ -23,7 +23,7 @@ from taichi_mrf.system.files import is_folder
 def run_diff(options: Diff) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     if options.out is not None and options.out.suffix.lower() != ".ply":
-        raise ConfigError(f"{options.out}: changes are written as a .ply")
+        raise ConfigError(f"{options.out}: --out must end in .ply")
     runtime.init(options.arch)
     a, b = _whole(options.a), _whole(options.b)
     found = compare_maps(a.decided, b.decided)

@@ -25,7 +25,7 @@ SOMETHING_TO_MEND = 4
 def run_doctor(options: Doctor) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     if options.picture is not None and options.picture.suffix.lower() != ".png":
-        raise ConfigError(f"--picture writes a .png, not {options.picture}")
+        raise ConfigError(f"{options.picture}: --picture must end in .png")
     if is_rendered(options.source):
         runtime.init(options.arch)
     reading = options.reading.keywords()
@@ -50,7 +50,7 @@ def run_doctor(options: Doctor) -> int:
     else:
         _print(Terminal(), found, options)
         if not drawn:
-            Terminal().print_line(f"{options.picture} is not written: no two frames see enough of the same.")
+            Terminal().print_line(f"{options.picture} is not written: no two frames overlap enough.")
     return SOMETHING_TO_MEND if found.findings else 0
 
 
@@ -61,8 +61,8 @@ def _print(console: Terminal, found: Diagnosis, options: Doctor) -> None:
     if not found.findings and found.before is not None:
         console.print_line("Nothing odd was found.")
     if found.before is not None and found.after is not None:
-        mended = f", {found.after:.1%} once mended" if found.after < found.before else ""
-        console.print_line(f"Frames that see the same differ by {found.before:.1%} of depth as read{mended}.")
+        mended = f", {found.after:.1%} once corrected" if found.after < found.before else ""
+        console.print_line(f"Overlapping frames differ by {found.before:.1%} of depth as read{mended}.")
     if found.undecided:
         console.print_line(f"The recording cannot tell {', '.join(found.undecided)}.")
     flags = dict.fromkeys(each.flag for each in found.findings if each.flag)

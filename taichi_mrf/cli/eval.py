@@ -35,7 +35,7 @@ def run_eval(options: Eval, experiments: Mapping[str, Any] | None = None) -> int
         raise ConfigError(f"unknown experiment '{options.experiment}'; {hint}")
     names = list(known) if options.experiment == ALL else [options.experiment]
     if any(known[name].needs_data for name in names) and not is_folder(options.data):
-        raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
+        raise DatasetError(f"{options.data}: no such folder; --data must name the folder with the scenes")
     with (
         output_folder(options.out),
         stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,

@@ -21,7 +21,7 @@ from taichi_mrf.sensor.noise import PolynomialNoise
 def run_import(options: Import) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     if options.out.suffix.lower() != ".npz":
-        raise ConfigError(f"{options.out}: a map is an .npz file")
+        raise ConfigError(f"{options.out}: --out must end in .npz")
     leaves = read_octomap(options.file)
     leaves = dataclasses.replace(leaves, log_odds=_known(leaves.log_odds))
     bricks, log_odds = leaves.bricks()

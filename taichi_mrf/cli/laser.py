@@ -159,7 +159,7 @@ def run_laser(options: Laser) -> int:
             registration = _floor_plan(options, scans)
             beams = beams_of(scans, options.settings.max_range, _NO_RETURN_IS_FREE[options.no_returns])
             if len(beams) == 0:
-                raise DatasetError(f"{options.scans}: no beam of the {len(scans)} scans says anything")
+                raise DatasetError(f"{options.scans}: no beam of the {len(scans)} scans is usable")
         with _timed(seconds, "graph"):
             runtime.init(options.runtime.arch, options.runtime.threads)
             graph = build_graph(beams, options.settings.cell_size, options.memory_limit_gb)

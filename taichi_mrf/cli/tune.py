@@ -47,7 +47,7 @@ def run_tune(options: Tune) -> int:
         runtime.init(settings.runtime.arch, settings.runtime.threads)
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
         if dataset.tracked:
-            raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
+            raise DatasetError(f"{options.source}: tune needs poses: map it, then add ?poses=trajectory.txt")
         settings = with_tuned_noise(settings, dataset)
         count = options.frames or (FRAMES_TO_SEARCH if options.auto is not None else FRAMES_BY_HAND)
         choice = FrameChoice(options.first, options.stride, count, options.hold_out)

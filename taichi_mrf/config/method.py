@@ -77,13 +77,13 @@ class Method:
     """Keyframes can be aligned with the map: pose refinement and tracking."""
 
     has_layers: bool = False
-    """Its map of a world that may change can be read as of another time and by layers."""
+    """Its map of a changing world can be read as of another time and by layers."""
 
     has_colors: bool = False
     """Keyframes may have colour images, and voxels then have colours."""
 
     measures_surface: bool = False
-    """Makes the surface that its keyframes measured."""
+    """Its maps can make a surface from the keyframes' measurements."""
 
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""

@@ -1,9 +1,8 @@
 """All parameters of mapping a sequence, and the sections that every mapping method shares.
 
-YAML files, the command line and the sliders are made from these dataclasses: a field's docstring is its
-help text, its default is the default, and its range is checked here. Where a field can be set besides Python,
-values.py says. Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at
-once.
+YAML files, the command line and the sliders are made from these dataclasses: a field's docstring is its help
+text, its default is the default, and its range is checked here. values.py says which fields files and flags
+can set. Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at once.
 """
 
 import dataclasses
@@ -61,15 +60,15 @@ class SensorConfig:
     """Side of the tables' square pixel patches, in pixels."""
 
     pixel_sigma: bool = True
-    """Use the standard deviation that frames state for each pixel, as stereo matching does. Otherwise
+    """Use each pixel's own standard deviation where frames state one, as those of stereo cameras do. If off,
     ``sigma`` or its table holds for all pixels."""
 
     sigma_scale: float = in_files(1.0)
-    """Factor on every standard deviation that is stated: by ``sigma``, its table, or frames. With
-    ``sigma_added`` it is what ``map --noise auto`` learns from a recording."""
+    """Factor on every standard deviation of ``sigma``, its table or frames. ``map --noise auto`` learns it
+    and ``sigma_added`` from a recording."""
 
     sigma_added: float = in_files(0.0)
-    """Metres added to every standard deviation after that: what poses and voxels add at all depths."""
+    """Metres added to every scaled standard deviation: the error of poses and voxels, at all depths."""
 
     min_depth: float = 0.1
     """Ignore measurements nearer than this (metres)."""
@@ -78,22 +77,22 @@ class SensorConfig:
     """Rays end at this depth (metres). A measurement beyond it only marks the space up to it as free."""
 
     no_return: Literal["ignore", "free", "model"] = "ignore"
-    """How MRFMap uses pixels that frames name as having got no return: not at all; as a free way up to
-    ``no_return_depth``; or as a chance that each surface on the way gave none, which ``model`` gives by
-    ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free`` alone."""
+    """Use of the pixels that frames mark as having no return. ``free``: space is free up to
+    ``no_return_depth``. ``model`` (mrf only): each surface on the ray may have given none, with a probability
+    set by ``no_return_share``, ``no_return_depth`` and ``no_return_width``."""
 
     no_return_share: float = in_files(0.3)
-    """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""
+    """Probability that a near surface gives no return, as dark, wet and shiny ones do; below 0.5."""
 
     no_return_depth: float = 10.0
-    """``free``: depth in metres up to which nothing stands where there is no return. ``model``: depth at
-    which half of the surfaces that return when they are near do so no more."""
+    """Depth in metres: with ``free``, space is free up to it where there is no return; with ``model``, half
+    of the surfaces that return when near no longer do so here."""
 
     no_return_width: float = in_files(2.0)
-    """Metres over which that share falls: at one width more it is 27%, at two 12%."""
+    """Metres over which that half falls with depth: to 27% one width further, to 12% two."""
 
     def __post_init__(self) -> None:
-        check_field(0 <= self.no_return_share < 0.5, "sensor.no_return_share", "must lie in 0 to below 0.5")
+        check_field(0 <= self.no_return_share < 0.5, "sensor.no_return_share", "must lie in [0, 0.5)")
         check_field(self.no_return_depth > 0, "sensor.no_return_depth", "must be positive")
         check_field(self.no_return_width > 0, "sensor.no_return_width", "must be positive")
         check_field(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
@@ -154,9 +153,9 @@ class PoseConfig:
     measured."""
 
     doubt_translation: float = 0.0
-    """Standard deviation of each keyframe's position along each axis, against the keyframes that see the same
-    surfaces (metres). With it and ``doubt_rotation`` rays say less where a wrong pose would change what they
-    meet. 0 takes positions as exact."""
+    """Standard deviation of each keyframe's position along each axis, relative to keyframes that see the same
+    surfaces (metres). Rays count less where such an error would change what they hit. 0 takes positions as
+    exact."""
 
     doubt_rotation: float = 0.0
     """Standard deviation of each keyframe's orientation about each axis (radians). 0 takes orientations as
@@ -191,16 +190,16 @@ class VolumeConfig:
     """Memory limit of the map in GB (voxels, images and messages). 0 means the free memory of the machine."""
 
     window_m: float = 0.0
-    """Keep in memory what lies within this distance of the newest keyframe's camera (metres). What lies
-    further is frozen and written to disk, and comes back when the camera returns, so that memory is bounded
-    on an endless run (methods that can freeze keyframes: mrf). 0 keeps the whole map in memory."""
+    """Keep in memory only the map within this distance of the newest keyframe's camera (metres). The rest is
+    frozen, written to disk, and read again when the camera returns, so that an endless run needs bounded
+    memory (methods that can freeze keyframes: mrf). 0 keeps the whole map in memory."""
 
     min_evidence: float = in_python(0.1)
     """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
     origin: tuple[float, float, float] = in_files((0.0, 0.0, 0.0))
-    """The map's origin in the recorded world (metres), which is far away if that is a country's. A recording
-    sets it; files with room for it have coordinates of the recorded world."""
+    """The map's origin in the recorded world (metres); far from 0 in a national grid. The recording sets it.
+    Exported files have the recorded world's coordinates, if their format can store them."""
 
     def __post_init__(self) -> None:
         check_field((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
@@ -274,8 +273,8 @@ class Config:
     them (methods whose maps have colours: mrf)."""
 
     keep_surface: bool = False
-    """Keep for each voxel what keyframes measured of the surface where their images are dropped: those of
-    frozen keyframes, and those of maps in submaps (methods that freeze keyframes: mrf)."""
+    """Keep the measured surface in each voxel when keyframes' images are dropped, as in freezing and in
+    submaps (methods that freeze keyframes: mrf)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""
@@ -311,7 +310,7 @@ class Config:
 
 
 def without_window(config: Config) -> Config:
-    """Copy of the parameters for a map that is in memory as a whole."""
+    """Copy of the parameters without a window: the whole map is in memory."""
     return dataclasses.replace(config, volume=dataclasses.replace(config.volume, window_m=0.0))
 
 

@@ -11,26 +11,25 @@ from typing import Literal
 from taichi_mrf.config.values import check_field, in_files, in_python
 
 LIVE_HALF_LIFE_S = 14400.0
-"""The half-life that a live run has by default: people and chairs move. All else maps a static world."""
+"""Default half-life of a live run, in which people and chairs move. Other commands map a static world."""
 
 
 @dataclass(frozen=True)
 class TimeConfig:
-    """How soon the world may change. Each voxel is a two-state Markov chain in time: what keyframes said of
-    the past counts for less, the longer ago it was, and never for more than the chance of a change since."""
+    """How soon the world may change. Each voxel is a two-state Markov chain in time: the older an
+    observation, the less it counts."""
 
     half_life_s: float = 0.0
-    """Seconds after which half of what is known of a voxel is out of date: how soon may a chair move? With
-    14400 (four hours) a few views are enough to see what is new, whatever was there before. 0 is a world
-    that never changes, for surveys."""
+    """Seconds after which half of what is known of a voxel is out of date. With 14400 (four hours) a few
+    views show a change, whatever was there before. 0 is a static world, as in surveys."""
 
     moving_share: float = in_files(1e-6)
-    """Share of space that things which come and go fill. The smaller it is, the more views it takes until a
-    surface that was seen often counts as gone. Only mrf uses it."""
+    """Share of space that moving things fill. The smaller it is, the more views it takes until a surface that
+    was seen often counts as gone. Only mrf uses it."""
 
     glimpse_half_life_s: float = in_files(2.0)
-    """Seconds after which half of a single view's claim is forgotten, if it contradicts what was known to be
-    free: a person who walks past. Later views confirm or deny it. Only mrf uses it."""
+    """Half-life in seconds of a single view that contradicts known free space, such as of a person walking
+    past. Later views confirm or refute it. Only mrf uses it."""
 
     def __post_init__(self) -> None:
         check_field(0 <= self.half_life_s < math.inf, "time.half_life_s", "must not be negative")
@@ -67,8 +66,8 @@ class InferenceConfig:
     Seidel)."""
 
     renew_tolerance: float = 0.35
-    """Live mapping: sweep a keyframe again once other keyframes have changed more than this share of the
-    marginals that it sees by more than 0.01 each. Full inference ignores this."""
+    """Live mapping: sweep a keyframe again once others have changed more than this share of its marginals by
+    over 0.01 each. Full inference ignores this."""
 
     surface_density: float = 2.1
     """Prior: expected number of surfaces per metre of ray. It means the same at every voxel size; 2.1 is the
@@ -78,18 +77,17 @@ class InferenceConfig:
     """Prior probability that a voxel is occupied. Overrides ``surface_density``."""
 
     outlier_floor: float | None = None
-    """Density of outliers per metre of depth, added to both sides of every message. It keeps a single wrong
-    pixel from overruling all others. By default 1e-6; 0.01 where a recording's rays are short."""
+    """Density of outliers per metre of depth, added to both likelihoods in every message. It keeps a single
+    wrong pixel from overruling all others. By default 1e-6; 0.01 for recordings with short rays."""
 
     ray_density: float = 2.5
     """Minimum rays cast at a voxel facing the camera, per centimetre of voxel size: 12.5 rays at 5 cm, 2.5 at
     1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
 
     pass_through: float | None = None
-    """Chance that a ray passes through an occupied voxel, below 1, because what is in it fills only a part.
-    With 0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs
-    stay in the map. By default 0.1 for a lidar's recording and 0 for all others. factor_graph() takes it as
-    0."""
+    """Probability (below 1) that a ray passes through an occupied voxel, as things fill only part of it. With
+    0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs stay
+    in the map. By default 0.1 for lidar recordings and 0 for others. factor_graph() uses 0."""
 
     free_share: float = 0.25
     """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see
@@ -175,7 +173,7 @@ class VisibilityConfig:
     grows by a few voxels a frame."""
 
     visible_if_clear: float = 1.0
-    """P(V_i | not C_i, V_i-1): the same for a voxel that is not locally occluded."""
+    """P(V_i | not C_i, V_i-1): probability that an unoccluded voxel behind a visible one is visible."""
 
     q_min: float = 0.1
     """A ray ends where the probability of visibility falls below this."""
@@ -207,20 +205,20 @@ class VisibilityConfig:
 class WavemapConfig:
     """Occupancy mapping by wavemap's measurement model (Reijgwart et al., RSS 2023).
 
-    The defaults are those that its authors publish for an Ouster OS0.
+    The defaults are its authors' for an Ouster OS0.
     """
 
     angle_sigma_deg: float = 0.035
     """Standard deviation of a beam's direction (degrees)."""
 
     range_sigma: float = 0.0
-    """Standard deviation of a range (metres). 0 means half a voxel, and 5 cm at least."""
+    """Standard deviation of a range (metres). 0 means half a voxel, but at least 5 cm."""
 
     scaling_free: float = 0.2
-    """How much of the model's evidence for free counts."""
+    """Factor on the model's evidence for free."""
 
     scaling_occupied: float = 0.4
-    """How much of the model's evidence for occupied counts."""
+    """Factor on the model's evidence for occupied."""
 
     beams: Literal["neighbours", "nearest", "ray"] = "neighbours"
     """The beams that update a voxel: the four nearest to its centre, the nearest, or the nearest in full

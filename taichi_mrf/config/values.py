@@ -20,7 +20,7 @@ from taichi_mrf.errors import ArgumentTypeError, ConfigError
 T = TypeVar("T")
 
 IN_FILES, IN_PYTHON = {"flag": False}, {"flag": False, "file": False}
-"""The metadata of such fields."""
+"""Metadata of fields without a flag, and of fields that only Python sets."""
 
 
 def in_files(default: T) -> T:
@@ -43,7 +43,7 @@ def is_in_files(field: "dataclasses.Field[Any]") -> bool:
     return bool(field.metadata.get("file", True))
 
 
-_ALWAYS = "all maps have {}, the best that was measured"
+_ALWAYS = "it is {} for all maps, the best value in tests"
 
 GONE: dict[str, dict[str, tuple[Any, str]]] = {
     "InferenceConfig": {
@@ -136,8 +136,8 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 100
 def from_dict(cls: type[T], values: Any, where: str) -> T:
     """Build a configuration dataclass from parsed YAML.
 
-    ``where`` is the file, for error messages. Warns of a parameter that is no more. Raises ConfigError for an
-    unknown key (naming the nearest), a value of the wrong type, or one outside its range.
+    ``where`` is the file, for error messages. Warns of a removed parameter. Raises ConfigError for an unknown
+    key (naming the nearest), a value of the wrong type, or one outside its range.
     """
     if values is None:
         values = {}

@@ -116,12 +116,12 @@ class Dataset(ABC):
 
     @property
     def stated(self) -> StatedSensor:
-        """Facts that the recording states of its sensor."""
+        """Properties of the sensor that the recording states."""
         return StatedSensor()
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
-        """Origin of its frames in the recorded world, (3,) metres: add it to their coordinates."""
+        """Origin of the frames in the recorded world, (3,) metres: add it to their coordinates."""
         return np.zeros(3)
 
     def check_scale(self, poses_are_used: bool) -> list[str]:

@@ -93,8 +93,8 @@ def check_metres(depths: Sequence[Image], where: str) -> None:
     median = float(np.median(values)) if len(values) else 0.0
     if median > _NO_METRES:
         raise DatasetError(
-            f"{where}: the numbers have a median of {median:.4g}, which are hardly metres: --depth-scale "
-            "1000 takes them for millimetres, --depth-scale 1 for metres all the same"
+            f"{where}: the numbers have a median of {median:.4g}, too much for metres: pass "
+            "--depth-scale 1000 if depth is in millimetres, --depth-scale 1 if it is in metres"
         )
 
 

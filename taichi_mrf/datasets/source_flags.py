@@ -26,7 +26,7 @@ class SourceFlags:
     """Undo a lens' distortion k1,k2,p1,p2[,k3] (as OpenCV has them); zeros leave the images as they are."""
 
     image_scale: float = 1.0
-    """Read 1/n of the rows and columns: 1, 0.5, 0.333, 0.25, ... Pixels are left out, none are mixed."""
+    """Read 1/n of the rows and columns: 1, 0.5, 0.333, 0.25, ... Pixels are dropped, not averaged."""
 
     max_time_gap: float | None = None
     """Largest difference in seconds between a depth image and the poses on either side of it."""
@@ -36,7 +36,7 @@ class SourceFlags:
     (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), mm or cm (unit), late=SECONDS."""
 
     mounting: str | None = None
-    """Place of the camera in the frame that the poses are of: x,y,z,qx,qy,qz,qw in metres."""
+    """Pose of the camera in the body frame of the recorded poses: x,y,z,qx,qy,qz,qw in metres."""
 
     depth_is: Literal["axial", "range"] = "axial"
     """Depth along the optical axis, or distance along each pixel's ray."""

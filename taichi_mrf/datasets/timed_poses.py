@@ -82,14 +82,14 @@ def check_unit(
     short, unit = _SHORTER_UNITS[times]
     faster, slower = ("the poses", f"the {what}") if power > 0 else (f"the {what}", "the poses")
     remedy = (
-        f"the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers says so"
+        f"add the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers"
         if power > 0
         else f"divide those of the {what} by {times:.0f}"
     )
     of_poses, of_data = (f"{min(each):.6g} to {max(each):.6g}" for each in (posed, stamps))
     raise DatasetError(
         f"{where}: the stamps of {faster} are {times:.0f} times those of {slower} ({source}: {of_poses}, "
-        f"{what}: {of_data}), as {unit} are beside seconds: {remedy}"
+        f"{what}: {of_data}), so they seem to be {unit}: {remedy}"
     )
 
 

@@ -15,37 +15,36 @@ class ExportOptions:
     """
 
     threshold: float = 0.5
-    """Voxels of at least this probability are points or cubes; a mesh lies where the probability is this."""
+    """Probability from which a voxel is written as a point or a cube, and at which a mesh lies."""
 
     cubes: bool = False
-    """Write the outsides of the voxels, as cubes: .ply, and .glb, .obj, .stl in place of marching cubes."""
+    """Write voxels as cubes: in .ply, and in .glb, .obj, .stl in place of marching cubes."""
 
     mesh: bool = False
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
     surface: Literal["auto", "rays", "marginal"] = "auto"
-    """Surface of a mesh: rays is the one that the keyframes' rays measured, below the size of voxels, and
-    marginal lies where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen,
-    and for a .zarr that holds it. rays also puts it into a .zarr, as auto does after --keep-surface."""
+    """Surface of a mesh: rays is the measured surface, finer than voxels; marginal is where the marginal
+    equals the threshold. auto is rays for a map with keyframes, none frozen, and for a .zarr that holds the
+    measured surface. A .zarr gets it with rays, and with auto after --keep-surface."""
 
     cells: bool = True
-    """Show a cell of 2, 4 or 8 voxels where it is likely enough and no voxel is: in a .ply as a point with
-    the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
+    """Show a cell of 2, 4 or 8 voxels if it reaches the threshold and none of its voxels does: in .ply as a
+    point with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
 
     color_by: Literal["auto", "marginal", "photo"] = "auto"
-    """Source of the colours of .ply, .glb, .obj, .ot, .html and .zarr: the marginals, or what cameras saw
-    (photo), if the map was made with colour images; auto is photo for such a map. .ot and .zarr have no
-    colours of marginals."""
+    """Colours in .ply, .glb, .obj, .ot, .html and .zarr: of the marginals (not in .ot and .zarr), or of the
+    colour images (photo). auto is photo if the map was made with colour images."""
 
     z_min: float | None = None
-    """Lower end in metres of the band of heights that a .pgm shows; heights count along up."""
+    """Lower end of the heights in a .pgm, in metres along the axis up."""
 
     z_max: float | None = None
-    """Upper end in metres of the band of heights that a .pgm shows."""
+    """Upper end of the heights in a .pgm, in metres along the axis up."""
 
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The world axis that is up in .pgm, .glb, .html and .zarr. auto takes the map's own, that of its first
-    keyframe's image, or z if the map does not hold it."""
+    """The world axis that is up in .pgm, .glb, .html and .zarr. auto is the up direction of the map's first
+    keyframe, or z if unknown."""
 
     occupied_from: float = 0.5
     """A cell of a .pgm is occupied if a voxel in the band has at least this probability."""

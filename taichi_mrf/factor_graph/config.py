@@ -37,8 +37,8 @@ class LaserConfig:
     dd-block dual decomposition by block-coordinate ascent."""
 
     iterations: int = 100
-    """Most iterations. One updates each beam once; of Metropolis-Hastings, it proposes as many flips as
-    there are cells that a beam crosses. Every method stops earlier when nothing changes any more."""
+    """Maximum number of iterations. Each updates every beam once; in Metropolis-Hastings it proposes as many
+    flips as cells are crossed by beams. All methods stop earlier once nothing changes."""
 
     seconds: float = 0.0
     """Stop after this time; 0 means no limit."""
@@ -63,8 +63,8 @@ class LaserConfig:
     """Gaussian model: standard deviation of a range in metres."""
 
     log_odds: float = 1.3863
-    """Inverse sensor model: log-odds of occupied that a return gives its cell, and takes from each cell
-    before it (1.3863 is a probability of 0.8)."""
+    """Inverse sensor model: log-odds that a return adds to its cell and subtracts from each cell before it
+    (1.3863 is a probability of 0.8)."""
 
     start: Literal["random", "inverse"] = "random"
     """Metropolis-Hastings: the first labelling, at random (Alg. 1) or from the inverse sensor model."""
@@ -73,7 +73,7 @@ class LaserConfig:
     """Metropolis-Hastings: independent chains, which run in parallel."""
 
     heat_bias: float = 4.0
-    """Metropolis-Hastings with a heat map: how much more often a cell in which a beam ends is proposed."""
+    """Metropolis-Hastings with a heat map: factor by which cells where beams end are proposed more often."""
 
     burn_in: float = 0.25
     """Metropolis-Hastings: share of the iterations that is left out of the marginals."""
@@ -86,24 +86,24 @@ class LaserConfig:
     changed (over disagreeing nodes only)."""
 
     batches: int = 32
-    """Parts into which the random schedule divides the beams. Those of one part are updated at once, and
-    the next part sees the outcome."""
+    """Number of batches of the random schedule. The beams of a batch are updated at once, and the next batch
+    sees the result."""
 
     tolerance: float = 1.0
-    """Belief propagation: a cell whose incoming log-odds have changed by less does not make its beams send
-    again, in the residual schedule, and no beam does when the method has converged."""
+    """Belief propagation, residual schedule: minimum change of a cell's incoming log-odds that makes its
+    beams send again. The method has converged when no cell has changed so much."""
 
     step: float = 50.0
     """Dual decomposition: the first step; step i is this divided by i + 1."""
 
     charge: Literal["whole", "mean"] = "whole"
-    """Dual decomposition: what a step charges each beam for what it says of a cell in disagreement. whole
-    charges all of them the whole step, as Alg. 2 is printed; mean is the projected subgradient, by how far
-    the beam is from the mean of all, which with a step of 1000 ends lower and has a far better bound."""
+    """Dual decomposition: update of the beams that disagree on a cell. whole is the whole step for each, as
+    Alg. 2 is printed; mean is the projected subgradient, the beam's difference from the mean of all, which
+    with a step of 1000 ends lower and has a far better bound."""
 
     polish: int = 5
-    """Belief propagation and dual decomposition: most sweeps of descent over the best labelling in the end,
-    each of which flips every cell whose flip lowers the energy. 0 leaves it as the paper has it."""
+    """Belief propagation and dual decomposition: maximum number of descent sweeps over the best labelling at
+    the end; each flips every cell whose flip lowers the energy. 0 is the paper's method."""
 
     def __post_init__(self) -> None:
         positive = ("cell_size", "sigma", "log_odds", "heat_bias", "step")

@@ -194,8 +194,8 @@ class Intake:
             if self._expects_no_return and frame.no_return is None:
                 self._expects_no_return = False
                 warnings.warn(
-                    f"frame {frame.name} does not name the pixels that got no return: sensor.no_return is "
-                    f'"{self.map.sensor.no_return}" and changes nothing for it',
+                    f"frame {frame.name} does not mark pixels without a return: sensor.no_return "
+                    f'"{self.map.sensor.no_return}" has no effect on it',
                     stacklevel=2,
                 )
             keyframe = self.map.add(frame)
@@ -221,7 +221,7 @@ class Intake:
             try:
                 closure = self._loops.took(keyframe)
             except CapacityError as error:
-                warnings.warn(f"closing a loop does not fit: {error}", stacklevel=2)
+                warnings.warn(f"a loop was not closed: {error}", stacklevel=2)
                 return None
         if closure is not None:
             self.result.loops_closed += 1

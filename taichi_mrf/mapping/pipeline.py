@@ -302,4 +302,4 @@ def _why_empty(dataset: Dataset, result: MappingResult) -> str:
     if result.skipped:
         count, problem = len(result.skipped), next(iter(result.skipped.values()))
         return f"{dataset.name}: no frame could be mapped; {count} could not be used, the first: {problem}"
-    return f"{dataset.name}: has no frame to map"
+    return f"{dataset.name}: contains no frame to map"

@@ -171,10 +171,10 @@ class Tracker:
         if self._lost > RULES.long_lost:
             least, most = RULES.strict_overlap, RULES.strict_through
         if through > most:
-            return f"it would look through {100 * through:.1f}% of what is mapped"
+            return f"it would look through {100 * through:.1f}% of the mapped surface"
         if overlap < least:
             near, needed = 100 * overlap, 100 * least
-            return f"{near:.0f}% of its points lie near what is mapped, and {needed:.0f}% are needed"
+            return f"{near:.0f}% of its points lie near mapped surfaces, {needed:.0f}% are needed"
         return ""
 
     def took(self, keyframe: int) -> TrackedFrame:

@@ -149,8 +149,7 @@ class BrickMap(Owned):
 
     @property
     def up(self) -> Up | None:
-        """The world axis that is up in the image of the first keyframe that was added, which may have been
-        removed since; None before it."""
+        """The world axis that is up in the image of the first keyframe ever added; None before it."""
         return self._up
 
     if TYPE_CHECKING:  # each method has its own
@@ -158,10 +157,10 @@ class BrickMap(Owned):
         def add_keyframe(self, *arguments: Any, **keywords: Any) -> int: ...
 
     def add(self, frame: Frame) -> int:
-        """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. What the frame
-        states of its measurements counts as the configuration says, and its colours if the map has any. The
-        first frame also says where the map's origin lies in the recorded world, if it was moved. Raises what
-        ``add_keyframe`` raises, and ConfigError for a frame of another origin."""
+        """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. The configuration
+        decides which of the frame's noise, missing returns and colours are used. The first frame sets the
+        map's origin in the recorded world. Raises the errors of ``add_keyframe``, and ConfigError for a frame
+        of another origin."""
         config = _at_origin_of(frame, self.config, is_empty=self.up is None)
         color = frame.color if self.METHOD.has_colors else None
         parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
@@ -186,7 +185,8 @@ class BrickMap(Owned):
 
     @property
     def decided(self) -> Any:
-        """The map whose log-odds say which voxels are occupied: this one, unless a method knows better."""
+        """The map whose log-odds decide which voxels are occupied: this one, unless the method overrides
+        it."""
         return self
 
     @tensors.in_kind("points", on_device=True)

@@ -101,11 +101,11 @@ class ChunkedMap:
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "decided")
 
     def calibrated(self) -> "ChunkedMap":
-        """The map by the probability that voxels hold a surface, as MRFMap.calibrated. Raises ConfigError if
-        the store does not hold what rays measured."""
+        """The map of calibrated probabilities, as MRFMap.calibrated. Raises ConfigError if the store does not
+        hold the measurements of rays."""
         if not self.has_surface:
             raise ConfigError(
-                f"{self.store.path}: holds nothing of what rays measured: map the recording anew with "
+                f"{self.store.path}: holds no measurements of rays: map the recording anew with "
                 "--keep-surface, or export from the map.npz of a run"
             )
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "calibrated")
@@ -122,7 +122,7 @@ class ChunkedMap:
 
     @property
     def has_surface(self) -> bool:
-        """True if the store holds what keyframes measured of the surface."""
+        """True if the store holds the measured surface."""
         return SURFACE in self.store.layers
 
     @property
@@ -134,8 +134,8 @@ class ChunkedMap:
         return self.chunks.min(axis=0) * side, (self.chunks.max(axis=0) + 1) * side
 
     def distances(self, first: NDArray[np.int64], after: NDArray[np.int64]) -> StoredDistances:
-        """The signed distances that keyframes measured, from the voxel ``first`` up to, but without,
-        ``after``, (3,) each."""
+        """The signed distances that keyframes measured, from the voxel ``first`` to ``after`` (exclusive),
+        (3,) each."""
         return StoredDistances(self.store, self.chunks, first, after)
 
     @tensors.in_kind("points")

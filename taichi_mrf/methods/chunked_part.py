@@ -39,9 +39,9 @@ normal and standard deviation depend on."""
 
 @dataclass
 class MapPart:
-    """The bricks of a chunked map from ``lowest`` up to, but without, ``after``, (3,) each; everything
-    outside is unknown. ``free_bricks`` (n, 3) were seen to be free and have no voxels. It has the queries of
-    a map, but no keyframes and no inference."""
+    """The bricks of a chunked map from ``lowest`` to ``after`` (exclusive), (3,) each; everything outside is
+    unknown. ``free_bricks`` (n, 3) were seen to be free and have no voxels. It has the queries of a map, but
+    no keyframes and no inference."""
 
     source: ChunkedMap
     lowest: NDArray[np.int64]
@@ -90,7 +90,7 @@ class MapPart:
     def measured_depth(
         self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
     ) -> NDArray[np.float32]:
-        """NaN everywhere (H, W): the measured surface is not looked for."""
+        """NaN everywhere (H, W): a part does not use the measured surface."""
         return np.full(camera.shape, np.nan, np.float32)
 
     @tensors.in_kind("points")
@@ -154,7 +154,7 @@ class MapPart:
 
     @property
     def has_surface(self) -> bool:
-        """True if the map holds what keyframes measured of the surface."""
+        """True if the map holds the measured surface."""
         return self.source.has_surface
 
     def surface(self) -> FusedSurface:

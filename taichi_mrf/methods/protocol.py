@@ -126,9 +126,9 @@ class OccupancyMap(VoxelMap, Protocol):
         default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
         maps that have colours (``METHOD.has_colors``); others raise ConfigError. ``noise`` is the keyframe's
         own noise model, ``sigma_m`` (H, W) its own standard deviation of each pixel's depth in metres (0 and
-        NaN: the noise model's), ``no_return`` (H, W) bool the pixels that got no return, which count as
-        ``sensor.no_return`` says in maps that take notice of them, ``pose_covariance`` (6, 6) how uncertain
-        the pose is (MRFMap.add_keyframe)."""
+        NaN: the noise model's), ``no_return`` (H, W) bool the pixels without a return, used according to
+        ``sensor.no_return`` in maps that support it, ``pose_covariance`` (6, 6) the uncertainty of the pose
+        (MRFMap.add_keyframe)."""
         ...
 
     def remove_keyframe(self, id: int) -> None:
@@ -138,7 +138,7 @@ class OccupancyMap(VoxelMap, Protocol):
     def move_keyframe(
         self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
     ) -> None:
-        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or that of before. Raises
+        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or the old one. Raises
         KeyframeError."""
         ...
 

@@ -134,7 +134,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def settled(self) -> bool:
-        """True if the voxels are those that the keyframes give."""
+        """True if the voxels are up to date with the keyframes."""
         return not self._stale
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
@@ -160,10 +160,9 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
         keyframes added before; ``noise``, ``sigma_m`` and ``pose_covariance`` are those of
-        MRFMap.add_keyframe, and ``no_return`` is checked, and ignored but by a log-odds map with
-        ``sensor.no_return: free``. Returns the keyframe's id.
-        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
-        for a ``color`` image: the map has no colours.
+        MRFMap.add_keyframe, and ``no_return`` is checked, and used only by a log-odds map with
+        ``sensor.no_return: free``. Returns the keyframe's id. Raises KeyframeError for a wrong shape or pose,
+        CapacityError if the map would not fit, ConfigError for a ``color`` image: the map has no colours.
         """
         if color is not None:
             raise ConfigError(f"a map of the method {self.METHOD.name} has no colours: pass no color")
@@ -194,7 +193,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     def move_keyframe(
         self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
     ) -> None:
-        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or that of before. The map
+        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or the old one. The map
         changes with the next :meth:`infer`."""
         keyframe, T = self._find(id), as_pose(T_world_camera)
         own = keyframe.own

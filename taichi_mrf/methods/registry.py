@@ -19,10 +19,10 @@ def create_map(config: Config, camera: Camera) -> OccupancyMap:
 
 
 def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
-    """A saved map, whatever its method; ``memory_limit_gb`` takes the place of its own. Raises MapFileError,
-    or CapacityError if there is not enough memory for it."""
+    """A saved map of any method; ``memory_limit_gb`` overrides its memory limit. Raises MapFileError, or
+    CapacityError if there is not enough memory for it."""
     if is_folder(Path(path)) and Path(path).suffix == SUFFIX:
-        raise MapFileError(f"{path}: a map in chunks; ChunkedMap.open reads it")
+        raise MapFileError(f"{path}: a map in chunks: open it with ChunkedMap.open")
     with open_map_file(Path(path)) as file:
         method = METHODS[method_of(file)]
     m: OccupancyMap = method.load_class().load(path, memory_limit_gb)

@@ -152,17 +152,16 @@ def slice_map(
     lower: ArrayLike | None = None,
     upper: ArrayLike | None = None,
 ) -> MapSlice:
-    """The layer of voxels at ``at`` metres: at this height with "up", else at this place along the axis.
+    """The slice of voxels at ``at`` metres along ``axis``, where "up" is the map's up (z if unknown).
 
-    Up is the map's ``up`` (z if it is unknown). The layer shows the
-    whole map, or the part between ``lower`` and ``upper``, (2,) in metres along the image's two axes. A level
-    layer is seen from above; in an upright one, up is up. Raises ConfigError for another axis, for corners
-    that make no box and for an empty map, CapacityError if the layer does not fit memory.
+    It covers the whole map, or the part between ``lower`` and ``upper``, (2,) in metres along the image's two
+    axes. A horizontal slice is seen from above; in a vertical one, up is up. Raises ConfigError for another
+    axis, for corners that make no box and for an empty map, CapacityError if the slice does not fit memory.
     """
     if axis not in ("up", *get_args(Axis)):
         raise ConfigError(f"axis must be up, x, y or z, not {axis!r}")
     if not np.isfinite(at):
-        raise ConfigError(f"a slice needs a finite place along {axis}, not {at}")
+        raise ConfigError(f"at must be a finite position along {axis}, not {at}")
     up_axis, sign = m.up or Z_UP
     number = up_axis if axis == "up" else "xyz".index(axis)
     place_m = sign * at if axis == "up" else at

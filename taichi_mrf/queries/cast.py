@@ -34,7 +34,7 @@ the time that four rays save."""
 class RayHits:
     """Ends of rays: ``hit`` (N,) is True where a ray met something, ``range`` (N,) float32 its length in
     metres, ``point`` (N, 3) float64 its end in the world; ``in_unknown`` (N,) is True where unknown space
-    ended it. A ray that nothing ends comes as far as the largest range."""
+    ended it. A ray without an end has the largest range."""
 
     hit: NDArray[np.bool_]
     range: NDArray[np.float32]
@@ -48,11 +48,11 @@ def cast_rays(
 ) -> RayHits:
     """Follow rays to the first voxel that is occupied (:meth:`state`), in one kernel for all of them.
 
-    ``origins`` and ``directions`` are (N, 3) in the world, in metres, or one of them (3,), for all rays;
-    directions need not be normalised. CPU and CUDA read float32 and float64 where they are. The range is that
-    of the face through which the ray enters the voxel, 0 if it begins inside. Raises ConfigError for another
-    policy, for arrays that do not fit or are not finite and for a direction of no length, CapacityError if
-    the rays reach through more space than fits memory.
+    ``origins`` and ``directions`` are (N, 3) in the world, in metres, or one of them is (3,), shared by all
+    rays; directions need not be normalised. CPU and CUDA read float32 and float64 without a copy. The range
+    is that of the face through which the ray enters the voxel, 0 if it begins inside. Raises ConfigError for
+    another policy, for arrays that do not fit or are not finite and for a direction of no length,
+    CapacityError if the rays reach through more space than fits memory.
     """
     m = m.decided
     if unknown not in _POLICIES:

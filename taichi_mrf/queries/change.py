@@ -66,7 +66,7 @@ class MapChange:
 
 
 def compare_maps(a: VoxelMap, b: VoxelMap, bricks: Bricks | None = None) -> MapChange:
-    """Compare two maps over all that is known in either, also seen-free space without voxels; or only in
+    """Compare two maps over all space known in either, including free space without voxels; or only in
     ``bricks``, (n, 3) coordinates.
 
     States are those of the maps' own log-odds: give ``m.decided`` to compare what is occupied. The maps can

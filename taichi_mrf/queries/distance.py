@@ -199,10 +199,10 @@ class DistanceField(Owned):
 
     A voxel's distance is that of its centre to the centre of the nearest obstacle, less half a voxel, so that
     it is 0 on the faces of obstacles. In obstacles it is negative: half a voxel less the distance to the
-    centre of the nearest voxel that is none. No distance is further from 0 than ``max_distance_m``.
+    centre of the nearest voxel that is not one. Distances are clamped at +-``max_distance_m``.
 
-    The field is that of the map at the last :meth:`update`. On the device of the map it takes
-    :attr:`bytes`, about 14 for each voxel within ``max_distance_m`` of an obstacle.
+    The field is that of the map at the last :meth:`update`. On the map's device it takes :attr:`bytes`, about
+    14 for each voxel within ``max_distance_m`` of an obstacle.
     """
 
     def __init__(
@@ -245,12 +245,12 @@ class DistanceField(Owned):
         return self._bricks.bytes
 
     def update(self, m: VoxelMap | None = None) -> int:
-        """Follow the map: work out the distances again that have changed with the states of voxels since the
-        last call, and return for how many voxels that is so. ``m`` is another map to follow from now on, such
-        as a later layer or reading, with voxels of the same size.
+        """Update the distances that have changed with the map since the last call; returns the number of
+        their voxels. ``m`` is another map to follow from now on, such as a later layer or reading, with
+        voxels of the same size.
 
-        Raises ConfigError for voxels of another size, CapacityError if there is not enough memory; after that
-        the field answers nothing until an update has ended.
+        Raises ConfigError for voxels of another size, CapacityError if there is not enough memory; after
+        that, queries fail until an update succeeds.
         """
         if m is not None:
             if not np.isclose(m.voxel_size, self.map.voxel_size, rtol=1e-6):
@@ -299,7 +299,7 @@ class DistanceField(Owned):
         known.
 
         Raises ConfigError for arrays that do not fit or are not finite, and for radii that are negative or
-        not less than ``max_distance_m``, of which the field cannot tell.
+        not less than ``max_distance_m``.
         """
         given = tensors.real_array(centres, "centres", ("C", "S", 3))
         radii = np.ascontiguousarray(tensors.on_host(radii_m, "radii_m"), np.float32)

@@ -78,11 +78,11 @@ class Frontiers:
 
 
 def find_frontiers(m: VoxelMap, min_voxels: int = 1) -> Frontiers:
-    """All free voxels that share a face with an unknown one; those that touch, also at a corner, are one
-    cluster. Clusters of less than ``min_voxels`` are left out.
+    """All free voxels that share a face with an unknown one. Those that touch, even at a corner, form one
+    cluster; clusters of less than ``min_voxels`` are left out.
 
-    The map is looked at chunk by chunk, so that memory is bounded by what is found. Raises ConfigError for
-    min_voxels below 1.
+    The map is read chunk by chunk, so that memory is bounded by the result. Raises ConfigError for min_voxels
+    below 1.
     """
     voxels = frontier_voxels(m)
     cluster, sizes = find_clusters(voxels, min_voxels)

@@ -34,8 +34,8 @@ class RayProfile:
     """Profile of a ray, voxel by voxel, where bricks exist; all arrays (N,) float32.
 
     ``distance`` is the range in metres to the middle of the ray's segment in the voxel, ``length`` the
-    segment's length in metres; ``occupancy`` the marginal, ``visibility`` what is left of the ray at the
-    segment's begin (eq. 15), ``omega`` the density, per metre, of the ray's surface being there (eq. 18).
+    segment's length in metres; ``occupancy`` the marginal, ``visibility`` the probability that the ray
+    reaches the segment (eq. 15), ``omega`` the density, per metre, of the ray's surface being there (eq. 18).
     """
 
     distance: NDArray[np.float32]

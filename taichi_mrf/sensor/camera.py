@@ -36,11 +36,11 @@ class Camera(Protocol):
 
     @property
     def width(self) -> int:
-        """Columns of its images."""
+        """Columns of the image."""
 
     @property
     def height(self) -> int:
-        """Rows of its images."""
+        """Rows of the image."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -85,8 +85,8 @@ class Camera(Protocol):
 class PinholeCamera:
     """An undistorted pinhole camera; all lengths in pixels.
 
-    The ray of pixel (u, v) (column, row) goes through the pixel's centre, which has the coordinates
-    (u, v): the principal point of a camera with W columns that looks straight ahead is (W - 1) / 2.
+    The ray of pixel (u, v) (column, row) goes through the pixel's centre, which has the coordinates (u, v): a
+    centred principal point is ((W - 1) / 2, (H - 1) / 2).
     """
 
     width: int

@@ -22,8 +22,8 @@ _CLOSE_PX = 1e-4
 
 
 class DistortedCamera(RayTable):
-    """A pinhole with a distortion (camera.Camera). Depth is axial. Between pixels its rays are linear in
-    column and row; it is a ray table in all else, and equals the one with the same rays."""
+    """A pinhole camera with lens distortion (camera.Camera). Depth is axial. Rays between pixels are
+    interpolated linearly. Otherwise it is a ray table, and equals the table with the same rays."""
 
     def __init__(self, pinhole: PinholeCamera, coefficients: ArrayLike) -> None:
         """``coefficients`` are OpenCV's k1, k2, p1, p2, k3 and so on, 4, 5, 8, 12 or 14 of them.

@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Frame:
-    """A depth image, where it was taken, and with what.
+    """A depth image with its pose and its camera.
 
     ``depth_m`` is depth along the camera's rays, (H, W) float32 in metres; 0 means no measurement. It is
     axial depth for a pinhole, and range where rays have the length 1, as a lidar's have. ``T_world_camera``
     is (4, 4) float64. ``stamp`` is in seconds. ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0
     where a pixel has none, or None. ``name`` is what error messages and reports call this frame.
 
-    The other fields are None where the sensor's configuration answers for all frames: ``sigma_m``, (H, W)
-    float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
-    ``no_return``, (H, W) bool, the pixels that looked and got nothing back; ``origin_m``, where the world's
-    origin lies in the recorded world if it was moved (Dataset.origin_m). ``sensor`` names the sensor of a
-    recording of several. ``gyro`` has the camera's angular rates up to this frame and for at least the time
-    since the one before, ``acceleration`` its accelerations for the time since the two before.
+    The other fields are None if the sensor's configuration holds for the frame: ``sigma_m``, (H, W) float32,
+    the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
+    ``no_return``, (H, W) bool, the pixels without a return; ``origin_m``, where the world's origin lies in
+    the recorded world if it was moved (Dataset.origin_m). ``sensor`` names the sensor in a recording of
+    several. ``gyro`` holds the camera's angular rates since the previous frame or longer, ``acceleration``
+    its accelerations since the last but one.
     """
 
     depth_m: NDArray[np.float32]
@@ -58,24 +58,24 @@ class Frame:
 
     @property
     def own(self) -> OwnEvidence:
-        """Evidence that the frame states of its measurements, as it was read."""
+        """The frame's own noise, sigma and missing returns, as recorded."""
         return OwnEvidence(self.noise, self.sigma_m, self.no_return)
 
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:
-        """The part of it that a map with this configuration takes."""
+        """The part of :attr:`own` that a map with this configuration uses."""
         sigma_m = self._widened_sigma(sensor) if sensor.pixel_sigma else None
         no_return = self.no_return if sensor.no_return != "ignore" else None
         noise = None if self.noise is None else widened_noise(self.noise, sensor)
         return OwnEvidence(noise, sigma_m, no_return)
 
     def own_in(self, config: Config) -> OwnEvidence:
-        """Evidence that a map with this configuration takes, and how uncertain the frame's pose is."""
+        """:meth:`own_for` this configuration, with the covariance of the frame's pose."""
         poses = config.poses
         covariance = checked_covariance(covariance_of(poses.doubt_translation, poses.doubt_rotation))
         return replace(self.own_for(config.sensor), pose_covariance=covariance)
 
     def tells_anything(self, sensor: SensorConfig) -> bool:
-        """True if it holds a measurement, or a pixel without a return that such a map takes notice of."""
+        """True if it holds a measurement, or a pixel without a return that such a map uses."""
         missing = self.own_for(sensor).no_return
         return bool((self.depth_m > 0).any() or (missing is not None and missing.any()))
 

@@ -287,5 +287,5 @@ def _load_table(path: str, field: str) -> NDArray[np.float64]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {said(error)}") from error
     if table.dtype.kind not in "fiu":
-        raise ConfigError(f"{field}: {path} holds no table of numbers")
+        raise ConfigError(f"{field}: {path} is not a table of numbers")
     return _padded(table.astype(np.float64), f"{field}: {path}")

@@ -63,6 +63,6 @@ def turned(poses: Points, directions: Points, origins_m: Points | None = None) -
     R, t = poses[..., :3, :3], poses[..., :3, 3]
     off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0)
     if not (off < NEARLY_ORTHONORMAL and (np.linalg.det(R) > 0).all() and np.isfinite(t).all()):
-        raise ConfigError("the poses of a moving camera hold a value that is not finite, or no rotation")
+        raise ConfigError("poses of a moving camera hold a value that is not finite or an invalid rotation")
     origins = t if origins_m is None else (R @ origins_m[..., None])[..., 0] + t
     return (R @ directions[..., None])[..., 0], origins

@@ -61,7 +61,7 @@ class PixelSigma:
         table = self.noise.table(camera)
         if not isinstance(table, NoiseTable):
             raise ConfigError(
-                f"sigma_m needs noise made of polynomials, which {type(self.noise).__name__} is not: leave "
+                f"sigma_m needs polynomial noise, not {type(self.noise).__name__}: leave "
                 "out sigma_m, or add the keyframe with noise=PolynomialNoise(...)"
             )
         stated = (self.sigma_m > 0) & np.isfinite(self.sigma_m) & (self.depth_m > 0)

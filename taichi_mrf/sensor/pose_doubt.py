@@ -201,7 +201,7 @@ def doubtful_table(
     Raises ConfigError if that is not made of polynomials."""
     if not isinstance(table, NoiseTable):
         raise ConfigError(
-            "pose_covariance needs noise made of polynomials, which that of this keyframe is not: leave out "
+            "pose_covariance needs polynomial noise, which this keyframe does not have: leave out "
             "pose_covariance, or add the keyframe with noise=PolynomialNoise(...)"
         )
     of_pose = depth_sigma(depth_m, camera, covariance)

@@ -84,13 +84,13 @@ _SHORTEST = 1e-6
 
 
 class RayTable:
-    """A camera whose rays are given one by one (camera.Camera). It never changes, and equals every other
-    table with the same rays.
+    """A camera given by one ray for each pixel (camera.Camera). It is immutable, and equals every other table
+    with the same rays.
 
     Depth is the parameter of a ray along its direction: range for directions of length 1, axial depth for
-    those with z = 1. Between pixels directions are linear in column and row, and keep the length 1 if all
-    have it. Rays without a pattern, such as those of a point cloud, are an image of one row, and each is cast
-    alone, since neighbours in the row may be far from each other.
+    those with z = 1. Directions between pixels are interpolated linearly, and normalised if all have the
+    length 1. Rays without a pattern, such as those of a point cloud, are an image of one row, and each is
+    cast alone, since neighbours in the row may be far from each other.
 
     A sensor that moves while it measures has ``origins_m``: where its rays start, in the frame of the image's
     pose. Directions are in that frame too (:meth:`moving`).
@@ -183,12 +183,12 @@ class RayTable:
 
     @property
     def width(self) -> int:
-        """Columns of its images."""
+        """Columns of the image."""
         return self._table.shape[1]
 
     @property
     def height(self) -> int:
-        """Rows of its images."""
+        """Rows of the image."""
         return self._table.shape[0]
 
     @property

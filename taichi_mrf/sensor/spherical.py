@@ -15,7 +15,7 @@ class SphericalCamera(RayTable):
 
     Its frame has x forward, y to the left, z up. The ray of a pixel is (cos e cos a, cos e sin a, sin e) with
     the elevation e of its row and the azimuth a of its column plus its row's offset. Its length is 1, so
-    depth is range. It is a ray table in all else, and equals the one with the same rays.
+    depth is range. Otherwise it is a ray table, and equals the table with the same rays.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class SphericalCamera(RayTable):
                 f"azimuth_offsets_rad has {len(offsets)} values, but there are {len(elevations)} elevations"
             )
         if np.abs(elevations).max() > np.pi / 2 + 1e-6:
-            raise ConfigError("elevations_rad has an angle of more than a right angle: is it in degrees?")
+            raise ConfigError("elevations_rad has an angle beyond pi / 2: is it in degrees?")
         self._beams = elevations, azimuths, offsets
         e, a = elevations[:, None], azimuths[None, :] + offsets[:, None]
         super().__init__(

@@ -64,11 +64,11 @@ _log = logging.getLogger(__name__)
 def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: bool = False) -> str:
     """Start Taichi and return the backend's name; :func:`choice` and the log have the details.
 
-    ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
-    Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
-    ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (benchmarks/speed/profile.py).
-    Once Taichi runs, "auto" or the same arch change nothing. The calling thread becomes the owner of
-    Taichi: maps can be used in no other thread (system/owner.py).
+    ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that is available. A software Vulkan
+    device is used only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores), ``debug``
+    checks array bounds, ``profile`` lets Taichi time each kernel (benchmarks/speed/profile.py). Once Taichi
+    runs, "auto" or the same arch change nothing. The calling thread becomes the owner of Taichi: maps can be
+    used in no other thread (system/owner.py).
 
     Raises BackendError if the requested backend is not available or another one already runs, and in another
     thread or a forked process. A requested backend is never replaced by another one.

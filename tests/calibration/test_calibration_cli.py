@@ -285,8 +285,8 @@ def test_bad_chessboards_are_refused_in_one_line(tmp_path: Path, refused: Refuse
 
 def test_flags_that_do_not_go_together_are_refused(tmp_path: Path, refused: Refused) -> None:
     depth = write_depth(tmp_path / "depth", (6, 8))
-    assert "either from --true-depth or from a chessboard" in refused(depth)
-    assert "either from --true-depth or from a chessboard" in refused(
+    assert "give one source of true depth: --true-depth, or --images" in refused(depth)
+    assert "give one source of true depth: --true-depth, or --images" in refused(
         depth, "--true-depth", depth, "--images", depth
     )
     assert "--camera-poses and --board-poses go together" in refused(

@@ -253,7 +253,7 @@ def test_a_camera_info_a_moment_later_is_the_images(make: Make) -> None:
 @pytest.mark.parametrize("topic", ["/mavros/local_position/pose", "/robot_pose", "/amcl_pose", "/pose"])
 def test_poses_of_an_unknown_body_are_not_the_cameras(make: Make, topic: str) -> None:
     path = make(images, partial(stamped_poses, topic=topic, T_body_own=T_body_camera))
-    refused(path, f"topic {topic}", "names no body", f"?body={FRAME}")
+    refused(path, f"topic {topic}", "name no child frame", f"?body={FRAME}")
     check_poses(open_dataset(f"{path}?body={FRAME}"))
 
 
@@ -285,7 +285,7 @@ def test_colours_and_depth_without_frames_are_not_taken_for_one_camera(make: Mak
         black(bag, "")
 
     path = make(partial(images, frame=""), beside, partial(stamped_poses, topic="/pose", frame=""))
-    refused(path, "names no body", "?optical=camera&body=camera")
+    refused(path, "name no child frame", "?optical=camera&body=camera")
     dataset = open_dataset(f"{path}?optical=camera&body=camera")
     check_poses(dataset, mount=np.eye(4))
     assert any("neither it nor depth names a frame" in note for note in dataset.notes)

@@ -211,7 +211,7 @@ def test_numbered_images_whose_trajectory_does_not_fit(tmp_path: Path) -> None:
     write_numbered(tmp_path, content)
     refused(tmp_path, "without a trajectory")
     path = write_stamped(tmp_path / "traj.txt", [1305031102.5], [np.eye(4)])
-    refused(tmp_path, f"{path}: its stamps are times, images are numbered, and there are 5 of")
+    refused(tmp_path, f"{path}: its stamps are times, images are numbered, and 5 images cannot be")
     write_rows(tmp_path / "traj.txt", content.poses)
     write_log(tmp_path / "two.log", content.poses)
     refused(tmp_path, "traj.txt, two.log; keep one")

@@ -169,7 +169,7 @@ def test_stamps_in_another_unit_than_the_images_are_named_with_the_remedy(
     (tmp_path / "poses.txt").write_text(poses.read_text())
     rescaled(poses, times)
     named = f"stamps of the poses are {times:.0f} times those of the depth images"
-    refused(folder, named, f"as {unit} are", f"'# stamp_{short} tx ty tz qx qy qz qw'")
+    refused(folder, named, f"they seem to be {unit}", f"'# stamp_{short} tx ty tz qx qy qz qw'")
     rescaled(poses, 1.0, f"# stamp_{short} tx ty tz qx qy qz qw")
     assert len(open_dataset(folder)) == 24
     rescaled(tmp_path / "poses.txt", times)

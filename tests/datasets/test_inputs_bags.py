@@ -178,7 +178,7 @@ def test_the_frame_of_a_topic_can_be_left_for_another(make: Make) -> None:
 
 def test_a_pose_without_a_mounting_is_not_taken_for_the_cameras(make: Make) -> None:
     path = make(images, odometry)
-    said = f"topic /odom: the poses are of {BODY}, and no transform from there to {FRAME} is in the bag"
+    said = f"topic /odom: the poses are of {BODY}, and no transform leads to {FRAME}"
     refused(path, said, f"?body={FRAME}")
     named = make(images, partial(odometry, child="camera"), name="camera")
     for source, note in (
@@ -201,7 +201,7 @@ def test_a_mounting_that_is_sent_now_and_then_holds_all_the_time(make: Make) -> 
 @pytest.mark.parametrize("frame", ["", "cam"])
 def test_images_of_a_frame_that_tf_lacks_name_the_remedy(make: Make, frame: str) -> None:
     path = make(partial(images, frame=frame), mounted, moving_tf)
-    refused(path, f"?optical=FRAME says which of tf's frames ({BODY}, {FRAME}, odom) is the sensor's")
+    refused(path, f"?optical=FRAME; tf has {BODY}, {FRAME}, odom")
     check_poses(open_dataset(f"{path}?optical={FRAME}"))
 
 
@@ -229,7 +229,7 @@ def test_depth_of_the_plain_transport_is_found_as_png_and_refused_as_jpeg(make: 
 
     path = make(compressed, own_poses, lambda bag: bag.camera_info("/cam/camera_info", FRAME, CAMERA))
     np.testing.assert_allclose(open_dataset(path).read(2).depth_m, steps(2) / 1000, rtol=1e-6)
-    refused(f"{path}?depth=/cam/jpg/compressed", "JPEG keeps 8 bits")
+    refused(f"{path}?depth=/cam/jpg/compressed", "JPEG keeps only 8 bits")
 
 
 @pytest.mark.parametrize("packing", ["compressedDepth", "compressedDepth png", "compressedDepth rvl"])

@@ -238,7 +238,7 @@ def test_scans_without_a_pose_are_dropped(survey: Any) -> None:
             r"none of 3 scans \(1100\.049 to 1100\.246 s\) has poses .*walk\.txt, 999\.950 to",
         ),
         (np.full(COUNT, np.nan), "", "goes from nan to nan s"),
-        (np.linspace(0, 1e300, COUNT), "", "which is no time"),
+        (np.linspace(0, 1e300, COUNT), "", "which are not times"),
         (TIMES, "?seconds=0", "seconds must be positive, not 0"),
         (TIMES, "?second=1", "unknown parameter 'second'"),
     ],

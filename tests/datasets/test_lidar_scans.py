@@ -250,7 +250,7 @@ def test_damaged_poses_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], 
 def test_as_many_stamped_poses_as_scans_or_names_that_are_times(tmp_path: Path) -> None:
     folder = plies_with_rows(tmp_path / "walk")
     write_stamped(folder / "poses.txt", range(4), [*WALK.poses, WALK.poses[0]])
-    refused(folder, "contains 4 poses with stamps for 3 scans, whose names are no stamps")
+    refused(folder, "contains 4 poses with stamps for 3 scans, whose names are not stamps")
     shutil.copy(folder / "poses.txt", folder / "poses2.txt")
     refused(folder, "contains several files of poses, poses.txt, poses2.txt")
 
@@ -323,7 +323,7 @@ def test_points_in_millimetres_are_refused_with_the_flag_that_takes_them(tmp_pat
     for folder, unit in ((metres, 1.0), (millimetres, 1000.0)):
         write_clouds(folder, ["0.ply", "1.ply", "2.ply"], unit=unit)
         write_rows(folder / "poses.txt", WALK.poses)
-    refused(millimetres, "which are hardly metres: --depth-scale 1000 takes them for millimetres")
+    refused(millimetres, "pass --depth-scale 1000 if depth is in millimetres")
     expected, found = open_dataset(metres), open_dataset(millimetres, depth_scale=1000.0)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a.depth_m, b.depth_m, rtol=1e-6)

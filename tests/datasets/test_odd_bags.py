@@ -81,7 +81,7 @@ def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
 
 def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(make: Make) -> None:
     path = make(in_map, in_map_tf, partial(moving_tf, parent="map", child="other"), kind="mcap")
-    refused(path, f"are of map, in which tf's frames {BODY}, other move", "?body=")
+    refused(path, "are in the fixed frame map", f"?body=FRAME, one of {BODY}, other")
     check_poses(open_dataset(f"{path}?body={BODY}"), T_MAP_ODOM, np.eye(4))
 
 
@@ -158,7 +158,7 @@ def pointer(path: Path) -> Path:
     ("damage", "words"),
     [
         (absent, ["metadata.yaml names files that are not there, walk.mcap: add them"]),
-        (pointer, ["is no bag, whatever its name; a pointer of git-lfs"]),
+        (pointer, ["is not a bag, despite its name; maybe a git-lfs pointer"]),
         (cut, ["damaged or cut short", "mcap recover"]),
     ],
 )
@@ -191,11 +191,14 @@ REFUSED: dict[str, tuple[Callable[[Bag], object], list[str]]] = {
     "encodings": (other_kinds, ["/jet (bgr8), /range (mono16). ?depth=/range takes"]),
     "millimetres": (
         lambda bag: but(bag, image=lambda i: steps(i).astype(np.float32), encoding="32FC1"),
-        ["hardly metres: --depth-scale 1000"],
+        ["too much for metres: pass --depth-scale 1000"],
     ),
     "clocks": (lambda bag: but(bag, late=-1000.0), ["clocks of sensor and poses are 1000.000 s apart"]),
     "slow": (slow, ["poses are 1 s apart; --max-time-gap 1 "]),
-    "path": (lambda bag: (images(bag), path_of(bag)), ["/path: it names no body", f"?body={FRAME}"]),
+    "path": (
+        lambda bag: (images(bag), path_of(bag)),
+        ["/path: its poses name no child frame", f"?body={FRAME}"],
+    ),
 }
 
 

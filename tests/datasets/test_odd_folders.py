@@ -209,7 +209,7 @@ def npy(folder: Path) -> None:
 REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "other poses": (
         poses(lambda i: stamped_line(0.1 * i, np.eye(4)) if i else ""),
-        "which belong together is not",
+        "cannot be matched with",
     ),
     "JSON": (jsons, "5 files such as frame_00000.json may hold.*--poses-are opengl"),
     "nerfstudio": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json.*--poses-are opengl"),
@@ -258,7 +258,11 @@ def test_floats_in_millimetres_are_refused_unless_the_scale_is_given(
     K = np.diag([14.0, 14.0, 1.0])
     write_npz(tmp_path / "a.npz", {"depth_m": depth, "T_world_camera": np.stack(CONTENT.poses), "K": K})
     if scale is None:
-        refused(tmp_path / "a.npz", "hardly metres: --depth-scale 1000", intrinsics=(14.0, 14.0, 7.5, 5.5))
+        refused(
+            tmp_path / "a.npz",
+            "too much for metres: pass --depth-scale 1000",
+            intrinsics=(14.0, 14.0, 7.5, 5.5),
+        )
     else:
         check(open_dataset(tmp_path / "a.npz", depth_scale=scale, intrinsics=(14.0, 14.0, 7.5, 5.5)), scale)
 

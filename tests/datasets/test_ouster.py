@@ -233,8 +233,8 @@ def test_a_scan_without_returns_says_so(played: Play) -> None:
     ("data", "problem"),
     [
         (b"", "is empty"),
-        (b"scans", "is no OSF file"),
-        (b"x" * 100, "is no OSF file"),
+        (b"scans", "not an OSF file"),
+        (b"x" * 100, "not an OSF file"),
         (osf(b"OSF$", b"OSF!"), "is cut short: its metadata are missing"),
         (WHOLE[:-1], "is cut short or damaged: 28 bytes at byte 72 do not fit"),
         (WHOLE[:80], "is cut short at byte 80"),

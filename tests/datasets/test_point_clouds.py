@@ -141,7 +141,7 @@ WRONG_HEADERS: list[tuple[Callable[..., Path], bytes, bytes, str]] = [
             (b"property double y", b"property double w", "no property y"),
             (b"property float z", b"property list uchar float z", "is not one number"),
             (b"property float z", b"property double x", "is not one number"),
-            (b"element vertex 42", b"element vertex many", "'many' is no number of elements"),
+            (b"element vertex 42", b"element vertex many", "'many' is not a number of elements"),
             (b"element vertex 42", b"element vertex", "is cut short"),
             (b"element vertex", b"element camera", "first element is not the vertex"),
         )
@@ -214,8 +214,8 @@ def test_las(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("data", "problem"),
     [
-        (b"", "it is no LAS file, or its header is cut short"),
-        (bytes(500), "it is no LAS file"),
+        (b"", "not a LAS file, or its header is cut short"),
+        (bytes(500), "not a LAS file"),
         (las_head(42)[:100], "its header is cut short"),
         (las_head(42)[:-1], "it claims 42 points of 28 bytes, more than it can hold"),
         (las_head(42, count=2**32 - 1), "it claims 4,294,967,295 points"),

@@ -322,7 +322,7 @@ def test_a_recording_without_poses_takes_those_of_a_file(tmp_path: Path) -> None
     np.testing.assert_allclose(dataset.read(2).T_world_camera, POSES[3], atol=1e-12)
     assert dataset.dropped == 1
     assert not dataset.tracked
-    with pytest.raises(DatasetError, match="poses that change need some to begin with"):
+    with pytest.raises(DatasetError, match="--follow needs poses from the start"):
         open_posed(tmp_path / "walk.bag", path, follow=True)
     tracked = open_posed(tmp_path / "walk.bag", None, track=True)
     with pytest.raises(DatasetError, match="cannot replace them"):

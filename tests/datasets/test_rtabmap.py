@@ -191,7 +191,7 @@ def test_damaged_files_and_images_are_named(tmp_path: Path) -> None:
     refused(path, "walk.db: cannot be read as an RTAB-Map database")
     path.unlink()
     sqlite3.connect(path).executescript("CREATE TABLE Node (id INTEGER)")
-    refused(path, "walk.db: is no database of RTAB-Map: it has no table Data, Admin")
+    refused(path, "walk.db: not an RTAB-Map database: it lacks the table Data, Admin")
     path.unlink()
     database = filled(path)
     database.connection.execute("UPDATE Data SET depth = ? WHERE id = 2", (encoded(DEPTH[1])[:-20],))

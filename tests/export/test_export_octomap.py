@@ -315,7 +315,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, content: bytes, problem: str)
 def test_files_that_are_not_there_and_names_that_are_no_map(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match=r"gone\.bt: there is no such file"):
         read_octomap(tmp_path / "gone.bt")
-    with pytest.raises(ConfigError, match=r"map\.bt: a map is an \.npz file"):
+    with pytest.raises(ConfigError, match=r"map\.bt: --out must end in \.npz"):
         run_import(tmp_path / "gone.bt", "--out", tmp_path / "map.bt")
 
 

@@ -105,7 +105,7 @@ def test_frames_that_do_not_name_pixels_without_a_return_are_reported_once() -> 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert isinstance(taken.offer(named), Added)
-    with pytest.warns(UserWarning, match="frame 1 does not name the pixels that got no return"):
+    with pytest.warns(UserWarning, match="frame 1 does not mark pixels without a return"):
         taken.offer(frames[1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -134,7 +134,7 @@ def test_a_loop_that_does_not_fit_into_memory_leaves_the_keyframe(monkeypatch: p
         raise CapacityError("no room")
 
     monkeypatch.setattr(LoopCloser, "took", full)
-    with pytest.warns(UserWarning, match="closing a loop does not fit: no room"):
+    with pytest.warns(UserWarning, match="a loop was not closed: no room"):
         result = map_sequence(walk(), CONFIG, limit=3)
     assert result.loops_closed == 0
     assert len(result.map.keyframes) >= 1

@@ -103,9 +103,9 @@ def test_a_broken_frame_ends_the_run_or_is_reported() -> None:
 @pytest.mark.parametrize(
     ("dataset", "words"),
     [
-        (sequence(0), "has no frame to map"),
+        (sequence(0), "contains no frame to map"),
         (sequence(2, broken=[0, 1]), "2 could not be used, the first: frame 0: the image is damaged"),
-        (sequence(2, blind=[0, 1]), "has no frame to map"),
+        (sequence(2, blind=[0, 1]), "contains no frame to map"),
     ],
 )
 def test_a_map_without_keyframes_is_an_error(dataset: SlidingCamera, words: str) -> None:

@@ -233,5 +233,5 @@ class NoPolynomials:
 
 def test_sigmas_need_polynomials() -> None:
     frame = stating(0)
-    with pytest.raises(ConfigError, match="sigma_m needs noise made of polynomials, which NoPolynomials"):
+    with pytest.raises(ConfigError, match="sigma_m needs polynomial noise, not NoPolynomials"):
         small_room.add(MRFMap(0.1), replace(frame, noise=NoPolynomials()))  # type: ignore[arg-type]

@@ -146,7 +146,7 @@ def no_space(*arguments: object) -> None:
 
 def test_without_a_folder_a_temporary_one_is_used_and_named() -> None:
     m = windowed()
-    with pytest.warns(UserWarning, match="volume.window_m: what lies outside the window is kept in"):
+    with pytest.warns(UserWarning, match="volume.window_m: the map outside the window is kept in"):
         walk(m, OUT)
     assert m.window is not None
     folder = m.window.folder

@@ -85,7 +85,7 @@ def test_colours_are_those_of_their_time() -> None:
 
 def test_there_is_no_surface_before_the_first_keyframe_and_none_after_a_change() -> None:
     m = repainted()
-    with pytest.raises(ConfigError, match="no keyframe up to this time"):
+    with pytest.raises(ConfigError, match="no surface at this time: all keyframes are later"):
         m.at(-1.0).surface()
     reading = m.at(2.5)
     m.remove_keyframe(0)

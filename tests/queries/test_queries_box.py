@@ -169,7 +169,7 @@ def test_a_part_of_a_slice(hand: HandMap) -> None:
 def test_slices_that_cannot_be(hand: HandMap) -> None:
     with pytest.raises(ConfigError, match="axis must be up, x, y or z, not 'w'"):
         slice_map(hand, 0.0, "w")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="finite place along up"):
+    with pytest.raises(ConfigError, match="finite position along up"):
         slice_map(hand, np.nan)
     with pytest.raises(ConfigError, match="two numbers"):
         slice_map(hand, 0.0, "z", (0, 0, 0), (1, 1, 1))

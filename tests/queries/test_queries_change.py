@@ -98,6 +98,6 @@ def test_the_command_writes_json_and_points(
 
 
 def test_changes_are_written_as_ply_only(two_maps: tuple[Path, Path], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"changes\.obj: changes are written as a \.ply"):
+    with pytest.raises(ConfigError, match=r"changes\.obj: --out must end in \.ply"):
         diff(*two_maps, "--out", tmp_path / "changes.obj")
     assert not list(tmp_path.iterdir())

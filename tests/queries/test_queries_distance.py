@@ -377,7 +377,7 @@ def test_what_cannot_be_worked_out(hand: HandMap, monkeypatch: pytest.MonkeyPatc
         field.clearance(np.zeros((2, 1, 3)), [0.4])
     with monkeypatch.context() as patch:
         patch.setattr("taichi_mrf.queries.distance_bricks._MOST_BRICKS", 10)
-        with pytest.raises(CapacityError, match=r"bricks of 8\^3 voxels are wanted and the most is 10"):
+        with pytest.raises(CapacityError, match=r"bricks of 8\^3 voxels are needed and the most is 10"):
             DistanceField(hand, MAX_M)
     monkeypatch.setattr(memory, "_allowance", memory._Allowance())
     monkeypatch.setattr(memory, "available_bytes", lambda: 10_000)

@@ -126,7 +126,7 @@ def test_a_picture_of_free_rays_has_their_origins() -> None:
         ),
         (lambda: RayTable(STILL.rays(), np.full((40, 3), np.nan)), "the origin of column 0, row 0"),
         (lambda: RayTable.moving(STILL, POSES[:5]), r"T_camera_column must be of shape \(40, 4, 4\)"),
-        (lambda: RayTable.moving(STILL, 2 * POSES), "no rotation"),
+        (lambda: RayTable.moving(STILL, 2 * POSES), "invalid rotation"),
         (lambda: RayTable.moving(STILL, POSES * np.nan), "not finite"),
         (lambda: RayTable.of_points(np.ones((3, 3)), POSES), r"T_camera_point must be of shape \(3, 4, 4\)"),
     ],

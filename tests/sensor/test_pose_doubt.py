@@ -170,5 +170,5 @@ def test_what_is_no_covariance_is_refused() -> None:
         with pytest.raises(KeyframeError, match=why):
             checked_evidence(np.ones(PINHOLE.shape, np.float32), PINHOLE, None, None, wrong)
     own = OwnEvidence(NoPolynomials(), pose_covariance=good)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="pose_covariance needs noise made of polynomials"):
+    with pytest.raises(ConfigError, match="pose_covariance needs polynomial noise"):
         own.noise_model(NOISE, np.ones(PINHOLE.shape)).table(PINHOLE)

@@ -59,7 +59,7 @@ def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--no-viewer"], "--no-viewer leaves nothing to do: add --auto N"),
-        (["--search", "inference.sweeps"], "--search says what --auto searches: add --auto N"),
+        (["--search", "inference.sweeps"], "--search needs a number of trials: add --auto N"),
         (["--hold-out", "1"], "--hold-out must be at least 2, not 1"),
         (["--auto", "2", "--no-viewer", "--search", "inference.swep"], "--search inference.swep: cannot be"),
         (["--auto", "2", "--no-viewer", "--first", "99"], "the first frame must lie between 0 and 8, not 99"),

@@ -126,7 +126,7 @@ def finished_report(task: MapTask) -> dict[str, Any] | None:
     if report is None or not all((task.out / name).is_file() for name in _FILES):
         return None
     if report.get("source") != task.source:
-        raise MapFileError(f"{task.out}: holds the map of {report.get('source')}")
+        raise MapFileError(f"{task.out}: holds the map of {report.get('source')}: choose another --out")
     changed = _changed_parameters(task)
     chosen = all(report.get(name) == value for name, value in task.choice().items())
     same = chosen and all(name.startswith("runtime.") for name in changed)
@@ -142,5 +142,5 @@ def report_in(folder: Path) -> dict[str, Any] | None:
     except (OSError, ValueError) as error:
         raise MapFileError(f"{path}: cannot be read: {error}") from error
     if not isinstance(report, dict):
-        raise MapFileError(f"{path}: holds no report")
+        raise MapFileError(f"{path}: not the report of a run")
     return report

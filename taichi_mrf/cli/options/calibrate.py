@@ -34,13 +34,14 @@ class Calibrate:
     registered to it."""
 
     camera_poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Motion capture of the camera: lines of stamp tx ty tz qx qy qz qw. One line is a camera on a tripod."""
+    """Motion capture of the camera: lines of stamp tx ty tz qx qy qz qw. A single line stands for a camera on
+    a tripod."""
 
     board_poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Motion capture of the board, in the same world."""
 
     stamps: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Lines of stamp and file name for the depth images; without it their names are stamps in seconds."""
+    """Lines of stamp and file name for the depth images; by default the file names are stamps in seconds."""
 
     camera: Annotated[
         tuple[float, float, float, float, float, float] | None,
@@ -52,14 +53,14 @@ class Calibrate:
     """Integer steps per metre in the measured depth."""
 
     true_depth_scale: float | None = None
-    """Steps per metre in the true depth, where they differ."""
+    """Steps per metre in the true depth, if different."""
 
     no_returns: bool = False
-    """Learn the chance that a surface gives no return too (``sensor.no_return: model``), from pixels that
-    have a true depth and no measured one. Needs --true-depth."""
+    """Also learn the probability of no return (``sensor.no_return: model``), from pixels that have a true
+    depth and no measured one. Needs --true-depth."""
 
     pictures: bool = True
-    """Draw bias and sigma against depth and over the image, and what was covered."""
+    """Draw bias and sigma against depth and over the image, and the coverage."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
@@ -73,8 +74,6 @@ class Calibrate:
         if self.no_returns and self.true_depth is None:
             raise ConfigError("--no-returns needs --true-depth: a board hides what is behind it")
         if (self.true_depth is None) == (self.images is None):
-            raise ConfigError(
-                "the true depth comes either from --true-depth or from a chessboard in --images"
-            )
+            raise ConfigError("give one source of true depth: --true-depth, or --images of a chessboard")
         if self.camera_poses is not None and self.images is None:
             raise ConfigError("--camera-poses needs the chessboard's --images, which give the time lag")

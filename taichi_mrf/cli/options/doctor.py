@@ -12,11 +12,11 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 
 @dataclass(frozen=True)
 class Doctor:
-    """Find out whether a recording is read as it was written, and which flag mends it if not.
+    """Check that a recording is read as it was written, and find the flag that corrects it if not.
 
-    The depths of some twenty frames are compared with each other: as they are read, and with the usual
-    mistakes of poses, stamps, units and intrinsics undone. The exit status is 0 if nothing is odd, 4 if there
-    is something to mend. Example: taichi-mrf doctor recording/ --picture overlap.png
+    The depths of some twenty frames are compared: as read, and with common errors of poses, stamps, units and
+    intrinsics corrected. The exit status is 0 if nothing is odd, 4 if there is something to correct. Example:
+    taichi-mrf doctor recording/ --picture overlap.png
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -26,8 +26,9 @@ class Doctor:
     """Poses of SOURCE's frames, in place of its own, as map takes them."""
 
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a picture (.png) of two frames on top of each other, as read on the left and mended on the right:
-    green where they agree, red where points of the one lie in front of what the other saw, blue behind."""
+    """Write a picture (.png) of two frames on top of each other, as read on the left and corrected on the
+    right: green where they agree, red where one frame's points lie in front of the other's surface, blue
+    behind it."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print what was found as JSON."""

@@ -58,8 +58,8 @@ class Laser:
     logs, most of which met glass or dark surfaces, and uses the others."""
 
     no_return_range: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Beams of at least this range did not come back. Without it the range is found in a CARMEN log, where it
-    stands out, and an npz file says it itself."""
+    """Beams of at least this range have no return. By default it is detected in a CARMEN log, and an npz file
+    states it."""
 
     memory_limit_gb: float = 0.0
     """Memory limit of the factor graph in GB; 0 uses what the machine has free."""
@@ -83,7 +83,7 @@ class Laser:
         if not 0 <= self.memory_limit_gb < math.inf:
             raise ConfigError(f"--memory-limit-gb must be 0 or a positive number, not {self.memory_limit_gb}")
         if (self.truth is None) != (self.truth_size is None):
-            raise ConfigError("--truth and --truth-size go together: the image, and how many metres it spans")
+            raise ConfigError("--truth and --truth-size go together: the image, and its size in metres")
         if self.truth_size is not None:
             self.truth_size_x_y()
         if self.compare and self.steps is not None:

@@ -17,10 +17,9 @@ from taichi_mrf.errors import ConfigError
 class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
-    Keyframes can be switched off and on, moved and frozen there, and rays inspected. The world may change:
-    --time.half-life-s is 14400 here, and 0 (a static world) for map. Ctrl-C ends the run and, with --out,
-    saves the map (exit status 130). Example: taichi-mrf live recording/ --out
-    runs/desk --open
+    On the page, keyframes can be switched off and on, moved and frozen, and rays inspected. The world may
+    change: --time.half-life-s is 14400 here, and 0 (a static world) for map. Ctrl-C ends the run and, with
+    --out, saves the map (exit status 130). Example: taichi-mrf live recording/ --out runs/desk --open
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
@@ -28,8 +27,8 @@ class Live:
     (map.npz). Of a folder that holds several recordings or maps, the page offers all; the first is taken."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for the files that map writes too: map.npz, voxels.ply, config.yaml, report.json, pictures if
-    the run ends by itself, trajectory.txt if poses are tracked. It is created if it does not exist."""
+    """Folder for the results, created if needed: map.npz, voxels.ply, config.yaml, report.json,
+    trajectory.txt if poses are tracked, and pictures unless the run is stopped."""
 
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace the run that DIR holds. Without it, a folder that holds a run is refused."""
@@ -90,9 +89,9 @@ class Live:
 
 @dataclass(frozen=True)
 class Demo(Live):
-    """See what the program does: map a built-in room, and open the page that shows it in a browser.
+    """Map a built-in room, and show it in the browser.
 
-    The same as live without a SOURCE, with --open. Ctrl-C ends it.
+    Equals live --open without a SOURCE. Ctrl-C ends it.
     """
 
     open: bool = True

@@ -56,8 +56,8 @@ class Map:
     run."""
 
     jobs: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Map this many of several sources at a time, each in its own process. They share the cores; with several
-    GPUs each gets one."""
+    """Number of sources to map at a time, each in its own process. They share the cores; with several GPUs
+    each gets one."""
 
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
     """Map on the workers of this Dask scheduler, such as tcp://10.0.0.1:8786; 'local' starts a Dask cluster

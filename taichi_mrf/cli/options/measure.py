@@ -13,7 +13,7 @@ from taichi_mrf.errors import ConfigError
 
 @dataclass(frozen=True)
 class Bench:
-    """Time what a new keyframe costs a live map, at several voxel sizes, beside OctoMap on the same frames.
+    """Time a new keyframe of a live map at several voxel sizes, and OctoMap on the same frames.
 
     The first frames fill the map; medians are of the last ten (of a quarter, if there are fewer than 40).
     Example: taichi-mrf bench recording/ --voxel-sizes 0.05 0.02 --plot stages.png
@@ -38,8 +38,8 @@ class Bench:
     """Draw the figures to this file (.png, .svg or .pdf)."""
 
     gate: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Compare the processors' time, as a share of OctoMap's, with that of an earlier --json FILE, made of the
-    same source; end with exit status 1 if a share is more than 10% larger."""
+    """Compare CPU times, relative to OctoMap's, with an earlier --json FILE of the same source; exit status 1
+    if one is more than 10% larger."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
@@ -57,7 +57,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class Eval:
-    """Repeat an evaluation of the papers, and print it beside what they report.
+    """Repeat an evaluation of the papers, and print its results beside theirs.
 
     Tables are written as CSV, LaTeX and PNG, with the configuration of every map. An
     interrupted run continues when it is started again with the same --out.
@@ -79,7 +79,7 @@ class Eval:
     """Voxel sizes in metres, instead of the experiment's own."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3)
-    """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
+    """Seeds of the simulated noise: the first for all methods, the others for the spread of MRFMap."""
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Use at most N views or folds, for a quick look."""
@@ -101,7 +101,7 @@ class Eval:
             raise ConfigError(f"--seeds must not be negative, not {min(self.seeds)}")
         for name, values in (("seeds", self.seeds), ("voxel-sizes", self.voxel_sizes)):
             if len(set(values)) < len(values):
-                raise ConfigError(f"--{name} must differ from each other, not {values}")
+                raise ConfigError(f"--{name} holds a value twice: {values}")
         for size in self.voxel_sizes:
             if not 0 < size < float("inf"):
                 raise ConfigError(f"--voxel-sizes must be positive numbers of metres, not {size}")

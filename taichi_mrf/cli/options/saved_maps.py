@@ -27,20 +27,19 @@ class Export:
     """The files to write."""
 
     layer: Literal["static", "dynamic", "both"] = "both"
-    """Part to write of a map whose world may change: what was there all along (static), what is there now
-    although it was free (dynamic), or both."""
+    """Part to write of a map of a changing world: what was always occupied (static), what is occupied now but
+    was free before (dynamic), or both."""
 
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Write
-    the map as it was believed then: a stamp as ``info`` shows them, or, below 0, seconds before the newest
-    keyframe."""
+    """Write the map as of this time: a stamp as ``info`` shows them or, if negative, seconds before the
+    newest keyframe."""
 
     lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Lower corner (metres) of the box to export from a map in chunks; without it, the box starts where the
     map does."""
 
     upper: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Upper corner of that box."""
+    """Upper corner (metres) of the box to export."""
 
     options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
         default_factory=ExportOptions
@@ -74,15 +73,15 @@ class Import:
 
 @dataclass(frozen=True)
 class Info:
-    """Show the backend that runs here and why, what each backend can do, and versions; or, with SOURCE, what
-    is in a recording and how to map it, or what is in a saved map.
+    """Show this machine's backends and all versions; or, with SOURCE, the contents of a saved map, or of a
+    recording and how to map it.
 
     The exit status is 0 only if map accepts the recording. Example: taichi-mrf info walk.bag
     """
 
     source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """A recording, as map takes it, or a saved map (map.npz, map.zarr, .bt, .ot). Of a bag, all topics are
-    listed too."""
+    """A recording, as map takes it, or a saved map (map.npz, map.zarr, .bt, .ot). For a bag, all topics are
+    listed."""
 
     arch: Arch = "auto"
     """Backend to start."""
@@ -109,7 +108,7 @@ class Diff:
     """The map after."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A .ply for the changes: the voxels that are occupied in one map only, coloured by which."""
+    """A .ply for the changes: the voxels that are occupied in one map only, coloured by map."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the comparison as JSON."""

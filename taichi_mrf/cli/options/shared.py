@@ -43,8 +43,8 @@ class NoiseFlags:
     """Source of sigma."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
-    """auto learns sigma from up to 60 frames first (DIR/sensor.yaml keeps it for other recordings); checked,
-    in map alone, from 16 frames, where sigma is the default and these contradict it; given never."""
+    """given: sigma of the parameters. auto: learnt first, from up to 60 frames, and kept in DIR/sensor.yaml
+    for other recordings. checked: given, but map learns it if 16 frames contradict the default."""
 
     @property
     def is_learnt(self) -> bool:
@@ -53,11 +53,11 @@ class NoiseFlags:
 
     @property
     def is_checked(self) -> bool:
-        """True if it is to be learnt if it is the default and held-out frames contradict it."""
+        """True if sigma is to be learnt where held-out frames contradict the default."""
         return self.origin == "checked"
 
     def refuse_with(self, **flags: object) -> None:
-        """Raises ConfigError if sigma is to be learnt and one of some other flags is set."""
+        """Raises ConfigError if sigma is to be learnt and one of these flags is set."""
         clashing = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value]
         if self.is_learnt and clashing:
             raise ConfigError(
@@ -80,23 +80,23 @@ class PoseFlags:
 
     file: Annotated[str | None, tyro.conf.arg(name="poses", metavar="FILE")] = None
     """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log), a pose graph (g2o,
-    TORO), a database of RTAB-Map, or a bag (walk.bag?pose=/PATH). Frames that it does not name keep their
+    TORO), a database of RTAB-Map, or a bag (walk.bag?pose=/PATH). Frames without a pose in FILE keep their
     own."""
 
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """The file of --poses changes while SOURCE is mapped: keyframes follow it. map ends when the recording is
-    over and the file has been unchanged for 10 s."""
+    """Move keyframes whenever the file of --poses changes during mapping. map ends after the recording, once
+    the file has been unchanged for 10 s."""
 
     def __post_init__(self) -> None:
         if self.follow and self.file is None:
-            raise ConfigError("--follow needs the file that is followed: --poses FILE")
+            raise ConfigError("--follow needs the file to follow: add --poses FILE")
         if self.file is not None and self.track_poses:
             raise ConfigError("--poses and --track-poses both say where the poses come from: choose one")
         if self.follow and self.refine_poses:
             raise ConfigError("--follow and --refine-poses both move keyframes: choose one")
 
     def choice(self) -> dict[str, Any]:
-        """Which poses are used, for the report; what is None was not asked for."""
+        """Sources of poses for the report; None if not requested."""
         return {
             "track_poses": self.track_poses,
             "poses_from": self.file,

@@ -27,24 +27,24 @@ class Tune:
     """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for tries.csv and the YAML files that are saved, with --auto for best.yaml, with --noise auto
-    for sensor.yaml; created if needed."""
+    """Folder for the results, created if needed: tries.csv, saved YAML files, best.yaml with --auto,
+    sensor.yaml with --noise auto."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters to begin with, such as those in configs/."""
 
     frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Number of frames, including those that are held out; 12 by default, 30 with --auto."""
+    """Number of frames, held-out ones included; 12 by default, 30 with --auto."""
 
     first: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Index of the first frame."""
 
     stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Take every N-th frame from there; 0 spreads them evenly over the sequence, at most 10 apart."""
+    """Take every N-th frame from the first; 0 spreads them evenly over the sequence, at most 10 apart."""
 
     hold_out: Annotated[int, tyro.conf.arg(metavar="N")] = 3
-    """One frame in N is held out of the map to score it. With --auto every second of these is hidden from the
-    search, too, and used for the final scores."""
+    """Hold out one frame in N to score the map. With --auto, half of them are kept from the search too, for
+    the final scores."""
 
     auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Search in N trials for parameters that score best on held-out frames (needs the extra auto: Optuna)."""
@@ -92,7 +92,7 @@ class Tune:
         check_least(self, frames=3, first=0, stride=0, hold_out=2, auto=1, seed=0, search_stride=0)
         check_port(self.port)
         if self.search and self.auto is None:
-            raise ConfigError("--search says what --auto searches: add --auto N")
+            raise ConfigError("--search needs a number of trials: add --auto N")
         if not self.viewer and self.auto is None:
             raise ConfigError("--no-viewer leaves nothing to do: add --auto N")
 

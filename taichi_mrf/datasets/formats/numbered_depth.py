@@ -153,9 +153,9 @@ def _poses_by_number(
     if trajectory.layout == "stamped" and not all(float(key).is_integer() for key in by_key):
         if len(poses) != len(numbers):
             raise DatasetError(
-                f"{trajectory.path}: its stamps are times, images are numbered, and there are {len(numbers)} "
-                f"of these and {len(poses)} poses, so which belong together is not known; name the images by "
-                "their stamps, or give one pose for each"
+                f"{trajectory.path}: its stamps are times, images are numbered, and {len(numbers)} images "
+                f"cannot be matched with {len(poses)} poses by their order; name the images by their stamps, "
+                "or give one pose for each"
             )
         ordered = sorted(poses, key=lambda pose: pose.key)
         return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in their order"]

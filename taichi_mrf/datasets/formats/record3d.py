@@ -211,7 +211,7 @@ class Metadata:
             except (ValueError, TypeError, IndexError, KeyError, OverflowError):
                 stamps = []
             if len(stamps) < len(numbers) or not all(map(math.isfinite, stamps)):
-                raise DatasetError(f"{self.where}: frameTimestamps is no list of a number for each frame")
+                raise DatasetError(f"{self.where}: frameTimestamps must be a number for each frame")
             return stamps, []
         if isinstance(rate, int | float) and _LEAST_RATE <= rate <= _LARGEST_RATE:
             return [number / rate for number in numbers], []
@@ -248,7 +248,7 @@ def _color_camera(where: str, values: Mapping[str, Any]) -> PinholeCamera:
     width, height = _whole(where, values, "w"), _whole(where, values, "h")
     K = _numbers(values.get("K"))
     if K.shape != (9,) or not np.isfinite(K).all():
-        raise DatasetError(f"{where}: K is no list of 9 numbers")
+        raise DatasetError(f"{where}: K is not a list of 9 numbers")
     with naming(f"{where}: K", ConfigError):
         return PinholeCamera.from_matrix(width, height, K.reshape(3, 3).T)
 
@@ -258,7 +258,7 @@ def _table(where: str, values: Mapping[str, Any], name: str, columns: int) -> ND
     found = values.get(name)
     table = _numbers(found) if found else np.empty((0, columns))
     if table.ndim != 2 or table.shape[1] != columns:
-        raise DatasetError(f"{where}: {name} is no list of {columns} numbers for each frame")
+        raise DatasetError(f"{where}: {name} is not a list of {columns} numbers for each frame")
     return table
 
 
@@ -276,7 +276,7 @@ def _whole(where: str, values: Mapping[str, Any], name: str) -> int:
     if isinstance(found, float) and found.is_integer():
         found = int(found)
     if not isinstance(found, int) or isinstance(found, bool) or not 0 < found <= MOST_PIXELS:
-        raise DatasetError(f"{where}: {name} is {str(found)[:40]}, which is no number of pixels")
+        raise DatasetError(f"{where}: {name} is {str(found)[:40]}, not a number of pixels")
     return found
 
 

@@ -90,7 +90,7 @@ class RtabmapDatabase:
         weakref.finalize(self, self._connection.close)
         missing = [name for name in ("Node", "Data", "Admin") if not self._columns(name)]
         if missing:
-            raise DatasetError(f"{path}: is no database of RTAB-Map: it has no table {', '.join(missing)}")
+            raise DatasetError(f"{path}: not an RTAB-Map database: it lacks the table {', '.join(missing)}")
 
     def close(self) -> None:
         """Close the file."""
@@ -292,7 +292,7 @@ def _camera(
     PinholeCamera(max(width, 1), max(height, 1), fx, fy, cx, cy)
     if len(distortion) and (len(distortion) not in DISTORTION_COUNTS or not np.isfinite(distortion).all()):
         raise DatasetError(
-            f"the lens has {len(distortion)} coefficients, which is no model of OpenCV's pinhole"
+            f"the lens has {len(distortion)} coefficients, which fits no pinhole model of OpenCV"
         )
     lens = tuple(map(float, distortion)) if distortion.any() else ()
     return NodeCamera((fx, fy, cx, cy), (max(width, 0), max(height, 0)), lens, T_body_camera)

@@ -80,7 +80,7 @@ def _read_odometry(path: Path) -> dict[int, RecordedPose]:
     names = [name.strip() for name in lines[0]] if lines else []
     missing = [name for name in _COLUMNS if name not in names]
     if missing:
-        raise DatasetError(f"{path}: its first line names no column {', '.join(missing)}")
+        raise DatasetError(f"{path}: its first line lacks the column {', '.join(missing)}")
     places = [names.index(name) for name in _COLUMNS]
     own = [names.index(name) for name in _INTRINSICS if name in names]
     poses = {}

@@ -345,7 +345,7 @@ def _word(path: Path, words: list[str], place: int) -> str:
 def _count(path: Path, words: list[str]) -> int:
     word = _word(path, words, 2)
     if not (word.isascii() and word.isdecimal()):
-        raise DatasetError(f"{path}: {word[:40]!r} is no number of elements")
+        raise DatasetError(f"{path}: {word[:40]!r} is not a number of elements")
     return int(word)
 
 

@@ -97,7 +97,7 @@ def _checked_header(stream: BinaryIO) -> tuple[int, int]:
     stream.seek(0)
     head = stream.read(375)
     if head[:4] != b"LASF" or size < _LEAST_HEADER:
-        raise ValueError("it is no LAS file, or its header is cut short")
+        raise ValueError("not a LAS file, or its header is cut short")
     header_bytes, begin, records, kind, point_bytes, count = struct.unpack_from("<HIIBHI", head, 94)
     if head[25] >= 4:
         long_records, count = struct.unpack_from("<IQ", head, 243)
@@ -201,7 +201,7 @@ def _groups(
         raise DatasetError(f"{path}: contains no point")
     if not np.isfinite(times).all() or (times.max() - times.min()) / seconds > _MOST_SCANS:
         raise DatasetError(
-            f"{path}: its gps_time goes from {times.min():g} to {times.max():g} s, which is no time"
+            f"{path}: its gps_time goes from {times.min():g} to {times.max():g} s, which are not times"
         )
     order = np.argsort(times, kind="stable")
     numbers = ((times[order] - times[order[0]]) / seconds).astype(np.int64)

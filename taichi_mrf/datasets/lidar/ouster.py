@@ -89,7 +89,7 @@ def _check_block(path: Path, file: BinaryIO, place: int, length: int) -> tuple[i
     """The end of a block, and its name."""
     head = file.read(12)
     if place == 0 and head[8:] != HEADER:
-        raise DatasetError(f"{path}: is no OSF file")
+        raise DatasetError(f"{path}: not an OSF file")
     if len(head) < 12:
         raise DatasetError(f"{path}: is cut short at byte {length:,}")
     left = struct.unpack_from("<I", head)[0] - 8

@@ -82,7 +82,7 @@ def poses_of(
         if len(trajectory.poses) != len(clouds):
             raise DatasetError(
                 f"{path}: contains {len(trajectory.poses)} poses with stamps for {len(clouds)} scans, whose "
-                "names are no stamps; name them by their times in seconds or nanoseconds, or write one pose "
+                "names are not stamps; name them by their times in seconds or nanoseconds, or write one pose "
                 "for each"
             )
         return {
@@ -113,8 +113,8 @@ def _check_one_map(path: Path, clouds: Sequence[Path], poses: int) -> None:
     """Raise DatasetError for one cloud with many poses: from which were its points measured?"""
     if len(clouds) == 1 < poses:
         raise DatasetError(
-            f"{path}: contains {poses} poses for one cloud, {clouds[0].name}, which does not tell from where "
-            "each of its points was measured: give each scan a file of its own, with its pose, or a .las "
+            f"{path}: contains {poses} poses for one cloud, {clouds[0].name}, so the sensor's pose for "
+            "each of its points is unknown: give each scan a file of its own, with its pose, or a .las "
             "with gps_time"
         )
 
@@ -304,7 +304,7 @@ def _viewpoints(path: Path, clouds: list[Path], at_origin: bool) -> dict[Path, S
         raise DatasetError(
             f"{path}: {what} the origin{why}, so their poses are not known; name a file of poses "
             "(T_world_sensor), one for each scan: ?poses=FILE. A map of many scans in one cloud does not "
-            "tell from where they were taken; ?points=sensor says that the origin is the sensor's place"
+            "hold their poses. If the origin is the sensor's position, pass ?points=sensor"
         )
     return {
         cloud: ScanPose(SECONDS_PER_SCAN * i, partial(_viewpoint, cloud), f"{cloud}: VIEWPOINT")

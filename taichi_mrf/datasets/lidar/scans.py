@@ -179,9 +179,8 @@ class LidarRecording(Dataset):
             far_m = median_range(frame.depth_m)
             if far_m > MOST_REACH_M and not self.unit_is_known:
                 raise DatasetError(
-                    f"{self.name}: half of the points of {frame.name} are further away than {far_m:.0f} m, "
-                    "which are hardly metres: --depth-scale 1000 takes them for millimetres, --depth-scale 1 "
-                    "for metres all the same"
+                    f"{self.name}: half of the points of {frame.name} are further away than {far_m:.0f} m: "
+                    "pass --depth-scale 1000 if depth is in millimetres, --depth-scale 1 if it is in metres"
                 )
             self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
             return

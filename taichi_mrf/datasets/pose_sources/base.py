@@ -248,5 +248,5 @@ def open_pose_source(name: str | Path) -> PoseSource:
 
 def _open3d(path: Path) -> Trajectory:
     if not is_trajectory_json(path):
-        raise DatasetError(f"{path}: is no {OPEN3D.looks_for}")
+        raise DatasetError(f"{path}: is not {OPEN3D.looks_for}")
     return read_trajectory_json(path)

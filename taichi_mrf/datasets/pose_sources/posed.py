@@ -327,7 +327,7 @@ def open_posed(
         except DatasetError:
             raise problem from None
         if follow:
-            raise DatasetError(f"poses that change need some to begin with: {problem}") from problem
+            raise DatasetError(f"--follow needs poses from the start: {problem}") from problem
         dataset.tracked = has_poses = False
     return posed_by(
         dataset,

@@ -119,7 +119,7 @@ def _grades(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return image
     if (image % (1 << _BITS)).any():
         raise DatasetError(
-            f"has values up to {image.max()}, which are no grades of 4 bits (0 to 15, or 0, 16, ... to 240)"
+            f"has values up to {image.max()}, which are not 4-bit grades (0 to 15, or 0, 16, ... to 240)"
         )
     return np.right_shift(image, _BITS, dtype=np.uint8)
 

@@ -73,10 +73,10 @@ def check_depth(encoding: str) -> None:
     if kind not in (*MILLIMETRES, METRES, PNG):
         raise DatasetError(f"encoding {encoding!r} is not depth; supported are {ENCODINGS}")
     if packing.startswith(("jpeg", "jpg")):
-        raise DatasetError(f"encoding {encoding!r} is no longer depth: JPEG keeps 8 bits of it, with losses")
+        raise DatasetError(f"encoding {encoding!r} is not depth: JPEG keeps only 8 bits, with losses")
     if not set(packing.split()) <= {*_PACKINGS, *MILLIMETRES, METRES}:
         raise DatasetError(
-            f"encoding {encoding!r} is depth that is packed in another way; supported are {ENCODINGS}"
+            f"encoding {encoding!r} is depth in an unsupported packing; supported are {ENCODINGS}"
         )
 
 

@@ -132,8 +132,8 @@ def find_poses(
         if tree.frames and optical not in tree.frames:
             known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
             problem += (
-                f". The messages are of {known}: ?optical=FRAME says which of tf's frames "
-                f"({', '.join(tree.frames)}) is the sensor's"
+                f". The messages are of {known}: set the sensor's with ?optical=FRAME; tf has "
+                f"{', '.join(tree.frames)}"
             )
         raise DatasetError(problem)
     if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
@@ -169,8 +169,8 @@ def _of_body(
     body = choice.body or below[0]
     if body not in below or (len(below) > 1 and not choice.body):
         raise DatasetError(
-            f"{reader.path}: the messages are of {fixed}, in which tf's frames {', '.join(below)} move: rays "
-            "begin where the sensor was, and ?body=FRAME says which of these it is"
+            f"{reader.path}: the messages are in the fixed frame {fixed}, but rays begin at the sensor: set "
+            f"its frame with ?body=FRAME, one of {', '.join(below)}"
         )
     if choice.frame not in ("", fixed):
         raise DatasetError(f"{reader.path}: the messages are of {fixed}, so the map is: leave out ?frame=")
@@ -302,13 +302,13 @@ def body_of(
             if optical not in tree.frames and not any(word in topic.lower() for word in CAMERAS):
                 if not optical and tree.frames:
                     raise DatasetError(
-                        "neither it nor the messages name a frame: ?optical=FRAME&body=FRAME says which of "
-                        f"tf's frames ({', '.join(tree.frames)}) are the sensor's and that of the poses"
+                        "neither the poses nor the data name a frame: set the sensor's and the poses' with "
+                        f"?optical=FRAME&body=FRAME; tf has {', '.join(tree.frames)}"
                     )
                 options = f"?body={own}" if optical else f"?optical={own}&body={own}"
                 raise DatasetError(
-                    f"it names no body that its poses are of, and no transform to {optical or 'the sensor'} "
-                    f"is in the bag: {options} takes them for the sensor's own, ?poses=FILE takes others"
+                    f"its poses name no child frame, and no transform leads to {optical or 'the sensor'}: "
+                    f"{options} uses them as the sensor's own, ?poses=FILE uses others"
                 )
             return (
                 optical,
@@ -320,14 +320,14 @@ def body_of(
         tree.check(optical)
         if not optical and tree.frames:
             raise DatasetError(
-                f"the poses are of {named}, and the messages name no frame: ?optical=FRAME says which of "
-                f"tf's frames ({', '.join(tree.frames)}) is the sensor's"
+                f"the poses are of {named}, and the messages name no frame: set the sensor's with "
+                f"?optical=FRAME; tf has {', '.join(tree.frames)}"
             )
         if not _is_cameras(named):
             same = f"?body={optical}" if optical else f"?optical={named}"
             raise DatasetError(
-                f"the poses are of {named}, and no transform from there to {optical or 'the sensor'} is in "
-                f"the bag: {same} takes them for the sensor's own, ?poses=FILE takes others"
+                f"the poses are of {named}, and no transform leads to {optical or 'the sensor'}: "
+                f"{same} uses them as the sensor's own, ?poses=FILE uses others"
             )
         return optical, (
             f", of {named}, assumed to be of the camera itself: "

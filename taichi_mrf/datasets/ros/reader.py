@@ -394,7 +394,7 @@ def _unreadable(problem: str) -> str:
             "that are there are read"
         )
     if "magic is invalid" in problem and "end magic" not in problem:
-        return "is no bag, whatever its name; a pointer of git-lfs, or a download that failed, looks so"
+        return "is not a bag, despite its name; maybe a git-lfs pointer, or a failed download"
     if "empty" in problem:
         return "is an empty file"
     return (

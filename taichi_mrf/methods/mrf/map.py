@@ -147,11 +147,11 @@ class MRFMap(BrickMap):
         which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
         deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
         for the model's, and an infinite one means no measurement; ``no_return`` is (H, W) bool, the pixels
-        that got no return, which count as ``sensor.no_return`` says; ``pose_covariance`` is (6, 6), that of
-        the twist xi, metres along and then radians about the camera's own axes, by which the true pose
-        T_world_camera exp(xi) may differ, None for an exact pose (sensor/pose_doubt.py). Returns the id.
-        Raises KeyframeError for a wrong shape or pose and for a matrix that is no covariance, CapacityError
-        if the map would not fit, ConfigError for noise that does not fit the camera.
+        without a return, used according to ``sensor.no_return``; ``pose_covariance`` is (6, 6), the
+        covariance of the pose error xi in the camera frame (metres, then radians) where the true pose is
+        T_world_camera exp(xi), None for an exact pose (sensor/pose_doubt.py). Returns the id. Raises
+        KeyframeError for a wrong shape or pose and for an invalid covariance, CapacityError if the map would
+        not fit, ConfigError for noise that does not fit the camera.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
@@ -195,13 +195,13 @@ class MRFMap(BrickMap):
         seconds: float | None = None,
         covariances: Mapping[int, ArrayLike] | None = None,
     ) -> "posed.PoseUpdate":
-        """Take in the poses, id -> (4, 4), of a trajectory that was corrected, as after a closed loop.
-        ``covariances``, id -> (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
+        """Apply a corrected trajectory, as after a loop closure: poses, id -> (4, 4). ``covariances``, id ->
+        (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
 
-        1. Keyframes whose view moves by more than half a voxel are withdrawn: what they said of wrong places
-           no longer counts.
-        2. All are moved and swept at their new poses one by one, each time the one whose viewpoint is
-           furthest from those of all keyframes in their places, so that few of them soon cover the map.
+        1. Keyframes whose view moves by more than half a voxel are withdrawn: their messages, which are of
+           wrong places, no longer count.
+        2. One by one, all are moved and swept at their new poses, each time the one whose viewpoint is
+           furthest from all keyframes already in place, so that a few soon cover the map.
         3. Those whose evidence has changed are swept again, as by :meth:`renew`, whose ``tolerance`` this is.
 
         A keyframe stays where it is if nothing in its view would move by more than ``least`` voxels, unless
@@ -237,8 +237,8 @@ class MRFMap(BrickMap):
     def refine_pose(
         self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
     ) -> "posed.RefinedPose":
-        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
-        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
+        """Move a keyframe to the nearby pose at which its depth is most likely in the map of the others. The
+        search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
         return posed.refine_pose(self._parts, id, config, guesses)
 
     def depth_log_likelihood(self, id: int) -> float:
@@ -254,8 +254,8 @@ class MRFMap(BrickMap):
     def freeze_keyframe(self, id: int) -> None:
         """Add a keyframe's messages to the evidence that inference starts from, and drop its image.
 
-        A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. Of bricks that
-        are not allocated yet, only that it saw them to be free is kept.
+        A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. In bricks that
+        are not allocated yet, only free space is kept.
         """
         inferring.freeze_keyframe(self._parts, id)
 
@@ -322,8 +322,8 @@ class MRFMap(BrickMap):
 
     def votes_at(self, point: ArrayLike) -> dict[int, float]:
         """The vote of each keyframe on the voxel at a point (3,) in metres, by id: the log-odds that it adds
-        to those of the others, above 0 for occupied. Keyframes that say nothing are left out, and frozen
-        ones."""
+        to those of the others, above 0 for occupied. Frozen keyframes and those without evidence are left
+        out."""
         inferring.restore_messages(self._parts)
         slots, numbers = self._registry.places_of(np.reshape(point, (1, 3)))
         sent = [(id, k.visible, k.messages) for id, k in self._keyframes.items() if k.messages is not None]
@@ -346,9 +346,9 @@ class MRFMap(BrickMap):
 
     @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours that cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue,
-        and how much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its
-        ray by the probability that they are what it saw, as of the last :meth:`infer`."""
+        """Colours of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how much of
+        the voxel was seen, 0 for nothing. Each pixel's colour is shared among the voxels on its ray by the
+        probability that it saw them, as of the last :meth:`infer`."""
         return self._current_colors().at(points)
 
     def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -356,8 +356,8 @@ class MRFMap(BrickMap):
         return self._current_colors().within(slots)
 
     def recent_colors(self) -> NDArray[np.uint8]:
-        """Colours (slots * 512, 4) while keyframes come, at the price of the new ones: those of others are
-        as they were found before (MapColors.follow)."""
+        """Colours (slots * 512, 4) while keyframes are added, at the cost of the new ones alone: colours by
+        earlier keyframes are not recomputed (MapColors.follow)."""
         inferring.restore_messages(self._parts)
         return self._parts.colors.follow()
 
@@ -368,19 +368,19 @@ class MRFMap(BrickMap):
 
     @property
     def keeps_surface(self) -> bool:
-        """True if frozen keyframes leave what they measured of the surface."""
+        """True if frozen keyframes' surface measurements are kept."""
         return self._parts.kept.wanted
 
     @property
     def has_surface(self) -> bool:
-        """True if there is a surface of all keyframes that the map was made of: none is frozen, or what
-        frozen ones measured is kept (``keep_surface``)."""
+        """True if the surface of all keyframes can be made: none is frozen, or their measurements are kept
+        (``keep_surface``)."""
         return self._parts.has_surface
 
     def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
-        """The signed distances that the keyframes measured, as of the last :meth:`infer`: found once for each
-        state of the map, and not to be written to. ``between`` is called after each keyframe. Raises
-        CapacityError if there is not enough memory."""
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`: computed once for
+        each state of the map, and read-only. ``between`` is called after each keyframe. Raises CapacityError
+        if there is not enough memory."""
         return surfacing.surface_field(self._parts, between)
 
     def surface(self, between: Callable[[], object] = lambda: None) -> "surfacing.FusedSurface":
@@ -389,9 +389,9 @@ class MRFMap(BrickMap):
         colour if keyframes have colour images.
 
         It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
-        Frozen keyframes have no images: their part is kept with ``keep_surface``, else they have none.
-        ``between`` is called many times in a second; what it raises ends the work. Raises ConfigError for a
-        map without keyframes, CapacityError if there is not enough memory.
+        Frozen keyframes have no images, and count only with ``keep_surface``. ``between`` is called many
+        times a second; an exception from it ends the work. Raises ConfigError for a map without keyframes,
+        CapacityError if there is not enough memory.
         """
         return surfacing.map_surface(self, self._parts, between)
 
@@ -404,60 +404,57 @@ class MRFMap(BrickMap):
         return self._parts.now_s
 
     def at(self, stamp_s: float) -> "reading.MapReading":
-        """The map as it was believed at a time in seconds, from the keyframes up to then.
+        """The map as of a time in seconds, from the keyframes up to then.
 
-        Frozen keyframes count from the newest of them on. Messages are those of now: they follow from all
-        keyframes, also from later ones. Raises ConfigError in a map of a static world
-        (``time.half_life_s`` is 0), where keyframes have no order.
+        Frozen keyframes count from the time of the newest of them on. Messages are the present ones, which
+        depend on later keyframes too. Raises ConfigError in a map of a static world (``time.half_life_s`` is
+        0), where keyframes have no order.
         """
         return self.layer("both", stamp_s)
 
     @property
     def static(self) -> "reading.MapReading":
-        """The static layer: the map without what came after its surroundings were mapped. Raises ConfigError
-        in a map of a static world."""
+        """The static layer: the map without what appeared after its surroundings were mapped. Raises
+        ConfigError in a map of a static world."""
         return self.layer("static")
 
     @property
     def dynamic(self) -> "reading.MapReading":
-        """The dynamic layer: what is occupied now, although all keyframes together say free and show no
-        surface near. All else is unknown. Raises ConfigError in a map of a static world."""
+        """The dynamic layer: voxels that are occupied now, but free by all keyframes together, without a
+        surface near. All others are unknown. Raises ConfigError in a map of a static world."""
         return self.layer("dynamic")
 
     def layer(self, which: "reading.Layer" = "both", stamp_s: float | None = None) -> "reading.MapReading":
-        """One layer of the map, "static" or "dynamic", or "both", which is the whole map, to be queried and
-        exported; as it was believed at ``stamp_s`` in seconds, now if None.
+        """A layer of the map for queries and exports: "static", "dynamic", or "both" (the whole map), as of
+        ``stamp_s`` in seconds, now if None.
 
-        Raises ConfigError for another name, and in a map of a static world, which has "both" only and no
-        other time than now.
+        Raises ConfigError for another name. A map of a static world has only "both", and only now.
         """
         return reading.layer(self, self._parts, which, stamp_s)
 
     @property
     def decided(self) -> "reading.MapReading":
-        """The map by what is occupied, to be queried, cast rays in, drawn and exported: :meth:`state` answers
-        by it.
+        """The map with a decision for each voxel, for queries, ray casts, pictures and exports; :meth:`state`
+        uses it.
 
-        Besides the voxels whose marginal is over one half it has those that win the vote of the rays: each
-        measured ray votes for the voxel that most likely is its first surface, and against those in front of
-        it (inference.surface_votes). A wall that is seen with a sigma of several voxels has no voxel that is
-        more likely occupied than not. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the
-        states allow, once the map is settled and has a surface; else those of winners are raised to just
-        above even odds, and all others are the marginals'. Votes of frozen keyframes are kept with
-        ``keep_surface``, else they have none.
+        Voxels are occupied if their marginal is over one half, or if they win the vote of the rays: each
+        measured ray votes for its most likely first surface, and against the voxels in front of it
+        (inference.surface_votes). Votes find walls seen with a sigma of several voxels, where no marginal is
+        over one half. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the states allow, if
+        the map is settled and has a surface; otherwise the marginals', with those of winners raised to just
+        above even odds. Frozen keyframes vote only with ``keep_surface``.
         """
         return self.decide()
 
     def decide(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
-        """:attr:`decided`; ``between`` is called after each keyframe whose votes or distances are found, and
-        what it raises ends the work. Raises CapacityError if there is not enough memory."""
+        """Compute :attr:`decided`. ``between`` is called after each keyframe; an exception from it ends the
+        work. Raises CapacityError if there is not enough memory."""
         return reading.decide(self, self._parts, between)
 
     def calibrated(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
-        """The map by the probability that each voxel holds a surface, from the distances of all rays
-        (methods.mrf.calibrated), which can be trusted as a probability; the marginals are more cautious.
-        Found once for each state of the map. ``between`` is called after each keyframe. Raises CapacityError
-        if there is not enough memory."""
+        """The map of calibrated probabilities that voxels hold a surface, from the distances of all rays
+        (methods.mrf.calibrated); the marginals are more cautious. Computed once for each state of the map.
+        ``between`` is called after each keyframe. Raises CapacityError if there is not enough memory."""
         return reading.calibrated(self, self._parts, between)
 
     def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
@@ -469,10 +466,9 @@ class MRFMap(BrickMap):
         return self._parts.decisions.winners(self.settled)
 
     def changes(self, since_s: float) -> "change.MapChange":
-        """Difference between the map as it was believed at a time in seconds and as it is now: its
-        ``appeared`` and ``vanished`` are voxels that were free and are occupied, and the reverse; ``points``,
-        ``before`` and ``after`` list all voxels whose state has changed, also those that were seen first
-        since then. Raises ConfigError in a map of a static world."""
+        """Difference between the map as of a time in seconds and now: ``appeared`` are voxels that were free
+        and are occupied, ``vanished`` the reverse; ``points``, ``before`` and ``after`` list all voxels whose
+        state has changed, newly seen ones included. Raises ConfigError in a map of a static world."""
         return change.compare_maps(self.at(since_s), self)
 
     def save(self, path: str | Path) -> None:

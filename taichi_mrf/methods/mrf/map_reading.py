@@ -48,9 +48,9 @@ class RaysThen:
 
 
 class MapReading(BrickMap):
-    """Other beliefs over the bricks of a map: a map that can be queried and exported, but not changed.
+    """Other beliefs over the bricks of a map: a read-only map for queries and exports.
 
-    It is good for as long as no keyframe of the map is added, removed, moved or frozen.
+    It is valid until a keyframe of the map is added, removed, moved or frozen.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class MapReading(BrickMap):
             self._check()
             return map_surface(self._source, self._parts)
         if not self.has_surface:
-            raise ConfigError("there is no keyframe up to this time: there is nothing to make a surface of")
+            raise ConfigError("there is no surface at this time: all keyframes are later")
         return surface(self, self.surface_field(), self._rays.least)
 
     @cached_property

@@ -175,7 +175,7 @@ class MovingWindow:
             for first in range(0, len(chunks), _AT_ONCE):
                 self._release(chunks[first : first + _AT_ONCE], header)
         except MapFileError as error:
-            warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
+            warnings.warn(f"the map outside the window stays in memory: {error}", stacklevel=2)
 
     def _release(self, chunks: NDArray[np.int32], header: StoreHeader) -> None:
         """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""

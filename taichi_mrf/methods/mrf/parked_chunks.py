@@ -90,7 +90,7 @@ class ParkedChunks:
         for name in names:
             chunk = chunk_of(name)
             if chunk is None or not is_file(folder / PARKED / name):
-                raise MapFileError(f"{folder / PARKED}: holds no file {name[:80]!r}, a part of the map")
+                raise MapFileError(f"{folder / PARKED}: the map's file {name[:80]!r} is missing")
             self._names[chunk] = name
         if self._names:
             self.folder, self._is_begun, self._saved = folder, True, set(self.names)
@@ -125,7 +125,7 @@ class ParkedChunks:
             self._temporary = tempfile.TemporaryDirectory(prefix="taichi_mrf_window_")
             self.folder = Path(self._temporary.name, f"map{SUFFIX}")
             warnings.warn(
-                f"volume.window_m: what lies outside the window is kept in {self.folder} until the map is "
+                f"volume.window_m: the map outside the window is kept in {self.folder} until the map is "
                 "dropped, because no folder was named (MRFMap.window.park_in)",
                 stacklevel=2,
             )

@@ -132,8 +132,8 @@ class MapParts:
 
     @property
     def has_surface(self) -> bool:
-        """True if there is a surface of all keyframes that the map was made of: none is frozen, or what
-        frozen ones measured is kept (``keep_surface``)."""
+        """True if the surface of all keyframes can be made: none is frozen, or their measurements are kept
+        (``keep_surface``)."""
         return bool(self.keyframes or self.frozen) and (self.kept.wanted or not self.frozen)
 
     @property

@@ -38,10 +38,9 @@ different directions from the same place are far apart."""
 
 @dataclass(frozen=True)
 class PoseUpdate:
-    """Result of MRFMap.update_poses: the keyframes that it ``moved``, those that it ``kept`` where
-    they were because their pose has hardly changed, and the new poses (4, 4) for which time was over, which
-    are ``left`` for the next call. ``report`` is that of the sweeps after all motions, or, if some are left,
-    of those sweeps that were made."""
+    """Result of MRFMap.update_poses: the keyframes ``moved``, those ``kept`` in place because their poses
+    hardly changed, and the new poses (4, 4) ``left`` for the next call. ``report`` is that of the sweeps
+    after all motions or, if some are left, of the sweeps so far."""
 
     moved: tuple[int, ...]
     kept: tuple[int, ...]

@@ -76,7 +76,7 @@ def surface(
 def map_surface(m: VoxelMap, parts: MapParts, between: Callable[[], object] = lambda: None) -> FusedSurface:
     """MRFMap.surface."""
     if not parts.keyframes and not parts.has_surface:
-        raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
+        raise ConfigError("the map has no keyframes, so it has no surface")
     return surface(m, surface_field(parts, between), LEAST * parts.prior, between)
 
 
