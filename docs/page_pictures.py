@@ -108,9 +108,9 @@ def live_images(page: LivePage) -> Image.Image:
 
 
 def live_baseline(page: LivePage) -> Image.Image:
-    """The map of OctoMap's update from the same keyframes, next to this one."""
+    """The map of OctoMap's update from the same keyframes, on the other side of a cut."""
     page.tab("Map")
-    level_cut(page, 0.6)
+    page.select("Cut axis", "x")
     page.tick("Show baseline")
     page.until(lambda seen: seen.baseline, "the other map")
     counts: list[int] = []

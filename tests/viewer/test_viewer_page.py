@@ -363,6 +363,45 @@ def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser:
     np.testing.assert_array_equal(camera.position, [7.0, 7.0, 7.0])
 
 
+@pytest.mark.parametrize("place", [0, 1])
+def test_the_map_of_another_recording_is_looked_at_anew(
+    handled: LivePage, browser: RawClient, place: int
+) -> None:
+    client = handled.client_id()
+    handled.take(Joined(client))
+    handled.page.viewpoint.map_grew(np.zeros(3), np.ones(3))
+    browser.say(camera_message(position=[7, 7, 7]))
+    camera = handled.server.get_clients()[client].camera
+    wait_for(lambda: camera.position[0] == 7.0, "the user's viewpoint")
+    handled.take(replace(HELLO, source="/data/desk", recordings=("a recording", "desk"), recording=place))
+    labelled = {"type": "SetGuiPanelLabelMessage", "label": "taichi_mrf: desk"}
+    browser.hear(lambda message: labelled.items() <= message.items())
+    handled.page.viewpoint.look_at_everything()
+    handled.page.viewpoint.map_grew(np.full(3, 40.0), np.full(3, 41.0))
+    kept = np.array_equal(camera.position, [7.0, 7.0, 7.0])
+    assert kept == (place == HELLO.recording)
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_cut_parts_the_map_from_the_baseline(handled: LivePage, flipped: bool) -> None:
+    bricks, log_odds = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
+    seen = np.ones((1, 512), np.uint8)
+    for layer in ("map", "baseline"):
+        handled.take(m.Bricks(layer, bricks, log_odds, seen, np.zeros((0, 3), np.int32)))
+    at_m = 3.5 * HELLO.voxel_size
+    cut = ViewOptions(show_baseline=True, cut_axis="y", cut_at_m=at_m, flip_cut=flipped)
+    for options, many in ((ViewOptions(show_baseline=True), (8, 8)), (cut, (5, 3) if flipped else (4, 4))):
+        handled.page.options = options
+        handled.page.map.look_changed()
+        handled.page._flush()
+        layers = [handled.page.map.layers[name] for name in ("map", "baseline")]
+        rows = [np.unique(np.round(layer.points()[:, 1] / HELLO.voxel_size - 0.5)) for layer in layers]
+        assert tuple(map(len, rows)) == many
+    # Without a cut the baseline lies aside, with one in its own place: no voxel of both, and none of neither.
+    np.testing.assert_array_equal(np.sort(np.concatenate(rows)), np.arange(8))
+    assert not layers[1].origin_m.any()
+
+
 def test_a_browser_that_sends_no_picture_keeps_nobody_waiting(
     handled: LivePage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -150,3 +150,10 @@ def test_each_edge_of_a_brick_is_drawn_once(bricks: set[tuple[int, ...]]) -> Non
     drawn = [tuple(tuple(point) for point in edge) for edge in edges.tolist()]
     assert len(drawn) == len(set(drawn))
     assert set(drawn) == wanted
+
+
+@given(cut=st.builds(Cut, st.integers(0, 2), st.integers(-9, 9), st.booleans()))
+def test_a_cut_and_its_other_side_keep_each_voxel_once(cut: Cut) -> None:
+    middles = np.arange(-12, 12) + 0.5
+    np.testing.assert_array_equal(cut.keeps(middles), ~cut.other_side.keeps(middles))
+    assert cut.other_side.other_side == cut

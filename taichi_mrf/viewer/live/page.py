@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -133,6 +134,8 @@ class Page(BasePage[Panel]):
 
     def _begin(self, hello: m.Hello) -> None:
         """Start with an empty map."""
+        if self.map is not None and hello.recording != self._hello.recording:
+            self.viewpoint.start_over()
         self.begin_map(hello)
         self._hello, self._in_photo = hello, False
         self.answer.clear()
@@ -141,6 +144,7 @@ class Page(BasePage[Panel]):
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
+        self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
         self.panel.show_keyframes({}, None)
         self.options = self.panel.view_options.value()  # what this map cannot show is not offered any more
         if self._extras(self.options) != self._extras(_PLAIN):

@@ -103,7 +103,8 @@ class ViewOptions:
     """Keep the view behind the camera."""
 
     show_baseline: bool = False
-    """Also map the same keyframes with OctoMap's log-odds update, and show that map next to this one."""
+    """Also map the same keyframes with OctoMap's log-odds update, and show that map next to this one, or
+    on the other side of the cut."""
 
     @property
     def shows(self) -> Show:
@@ -255,7 +256,8 @@ def legend_html(scale: Scale) -> str:
 
 def key_html(options: ViewOptions) -> str:
     """Key to the colours that are not on the scale, for the page: those of a cut, and of changes."""
-    named = dict(SPACE_COLORS) if options.cut_axis != "none" else {}
+    in_cut = options.cut_axis != "none" and not options.show_baseline
+    named = dict(SPACE_COLORS) if in_cut else {}
     if options.color_by == "changes":
         named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
@@ -264,7 +266,7 @@ def key_html(options: ViewOptions) -> str:
         f'<div style="{together}"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
-    unknown = " · unknown: nothing" if options.cut_axis != "none" else ""
+    unknown = " · unknown: nothing" if in_cut else ""
     return f'<div style="font-size:0.85em">{spans}{unknown}</div>' if named else ""
 
 

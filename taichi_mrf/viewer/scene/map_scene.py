@@ -4,7 +4,7 @@ Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times a secon
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -19,7 +19,7 @@ from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, Scale, Show, ViewOpt
 from taichi_mrf.viewer.scene.keyframe_layer import draw_lines, placement
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
-from taichi_mrf.viewer.scene.voxel_store import VoxelStore
+from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.viewer.scene.widgets import change
 from taichi_mrf.voxels.layout import BRICK
 
@@ -194,8 +194,13 @@ class MapScene:
         self._shows = options.shows
         map_changed = everything or bool(self.layers["map"].changed)
         any_changed = map_changed or bool(self.layers["baseline"].changed)
-        for layer in self.layers.values():
-            layer.prepare(look, everything, exactly=rested)
+        # A cut parts two maps: this one on its one side, the baseline's on the other.
+        both = bool(self.layers["baseline"].store.chunks)
+        cuts: dict[Layer, Cut | None] = {"map": look.cut, "baseline": look.cut}
+        if both and look.cut is not None:
+            cuts["baseline"] = look.cut.other_side
+        for name, layer in self.layers.items():
+            layer.prepare(replace(look, cut=cuts[name]), everything, exactly=rested)
         if everything:
             self.surface.outdate()
         if self.shows_surface:
@@ -206,13 +211,13 @@ class MapScene:
                 layer.send()
             self._show_one(self.shows_surface)
             if map_changed:
-                self._draw_cut(look, crossed)
                 self._draw_bricks(options.bricks)
                 self._draw_changes(options.color_by == "changes")
                 self._show_space(options, up)
             if any_changed:
-                self.layers["baseline"].place(self._baseline_m(up))
-                self._draw_names(up)
+                self._draw_cut(None if both else look.cut, crossed)
+                self.layers["baseline"].place(np.zeros(3) if look.cut else self._baseline_m(up))
+                self._draw_names(up, cuts if both else None)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
 
@@ -248,13 +253,13 @@ class MapScene:
                 self.ground.show(*box, up, height_m - up[1] * 0.5 * self._hello.voxel_size)
         change(self._server.scene.world_axes, visible=options.axes)
 
-    def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
+    def _draw_cut(self, cut: Cut | None, crossed: Iterable[NDArray[np.int32]]) -> None:
         hello, scene = self._hello, self._server.scene
-        if look.cut is None:
+        if cut is None:
             scene.remove_by_name("/cut")
             return
-        picture = cut_picture(self.store, look.cut, hello.prior_log_odds, hello.min_evidence, crossed)
-        show_cut(scene, hello.voxel_size, self.store, look.cut, picture)
+        picture = cut_picture(self.store, cut, hello.prior_log_odds, hello.min_evidence, crossed)
+        show_cut(scene, hello.voxel_size, self.store, cut, picture)
 
     def _draw_bricks(self, wanted: bool) -> None:
         """Draw the outlines of the map's bricks if they are ``wanted``."""
@@ -265,16 +270,18 @@ class MapScene:
         lines = brick_edges(bricks) * BRICK * self._hello.voxel_size
         draw_lines(self._server.scene, "/bricks", lines, _OUTLINE_COLOR, thickness=1.0)
 
-    def _draw_names(self, up: Up) -> None:
-        """Put a label above each map if there are two."""
-        two = bool(self.layers["baseline"].store.chunks)
+    def _draw_names(self, up: Up, cuts: Mapping[Layer, Cut | None] | None) -> None:
+        """Put a label above what is left of each map by its cut, if there are two."""
         for layer, text in _NAMES.items():
-            if not two:
+            if cuts is None:
                 self._server.scene.remove_by_name(f"/names/{layer}")
                 continue
             ends = self.layers[layer].ends_m()
             if ends is None:
                 continue
+            cut = cuts[layer]
+            if cut is not None:
+                ends[0 if cut.flipped else 1, cut.axis] = cut.plane * self._hello.voxel_size
             above = ends.mean(axis=0) + self.layers[layer].origin_m
             axis, sign = up
             above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()

@@ -90,6 +90,10 @@ class ViewpointController:
         if view is not None:
             self._point(handle, view)
 
+    def start_over(self) -> None:
+        """Forget which users have moved the view: another place is shown from now on."""
+        self._placed = {id: client.camera.position for id, client in self._server.get_clients().items()}
+
     def camera_moved(self, T_world_camera: Pose, forwards: NDArray[np.float64]) -> None:
         """Store the pose of a camera that looks ``forwards`` (3,) in its own frame, and follow it if
         following is on."""
@@ -184,11 +188,9 @@ class ViewpointController:
         slowly takes its first view after it was pointed elsewhere."""
         view = self._shared_view()
         if view is not None:
-            view = view.within(_ASPECT)
-            start = self._server.initial_camera
-            start.position, start.look_at, start.up, start.fov = (
-                view.eye_m, view.target_m, view.up, view.fov_rad,
-            )  # fmt: skip
+            view, start = view.within(_ASPECT), self._server.initial_camera
+            start.position, start.look_at = view.eye_m, view.target_m
+            start.up, start.fov = view.up, view.fov_rad
 
     def _behind_camera(self) -> _View | None:
         """The view that looks over the camera's shoulder; None before the first frame."""

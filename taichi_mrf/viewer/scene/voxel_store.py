@@ -56,6 +56,11 @@ class Cut:
         """The open side of the voxels at the cut, in voxels."""
         return self.voxel + (not self.flipped)
 
+    @property
+    def other_side(self) -> "Cut":
+        """The cut that hides what this one keeps."""
+        return Cut(self.axis, self.voxel + (-1 if self.flipped else 1), not self.flipped)
+
     def keeps(self, coordinates: NDArray) -> NDArray[np.bool_]:
         """Which coordinates (n,) of points on the axis, in voxels, are not cut away."""
         return coordinates >= self.plane if self.flipped else coordinates <= self.plane
