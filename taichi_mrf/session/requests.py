@@ -68,7 +68,7 @@ class Requests:
             PixelRay: self._pixel_ray,
             WhoSays: lambda request: run.send(run.mapper.votes_at(request.points)),
             Watch: extras.watch,
-            ShowTime: lambda request: run.show_time(request.stamp_s),
+            ShowTime: lambda request: run.show_time(request.stamp_s, request.play),
             Save: self._save,
             Quit: self._quit,
         }

@@ -35,6 +35,9 @@ RATE_SECONDS = 5.0
 """Seconds over which the keyframe rate is averaged."""
 
 
+PLAY_STEPS = 60
+"""Times from the first keyframe until now at which a map is shown when it is played."""
+
 PACE_SECONDS = 30.0
 """Seconds over which the pace of frames is averaged that the time left is computed from."""
 
@@ -138,6 +141,7 @@ class Run(SessionCore):
         super().__init__(link, policy)
         self.version = 0
         self.full: str | None = None
+        self._playing = False
         self.replay: Replay | None = None
         self.begin(source, first_id=0)
 
@@ -214,14 +218,23 @@ class Run(SessionCore):
         self._send_time()
         self.progress.measure(self.mapper)
 
-    def show_time(self, stamp_s: float | None) -> None:
-        """Show the map as of a time in seconds, None for now, once there is time to read it."""
+    def show_time(self, stamp_s: float | None, play: bool = False) -> None:
+        """Show the map as of a time in seconds, None for now, once there is time to read it; ``play`` goes on
+        from there to later times."""
+        self._playing = play
         self.mapper.shown.show(stamp_s)
         self._send_time()
 
     def renew_past(self) -> bool:
-        """Send what is shown of the past if it is outdated; returns whether there was anything to send."""
-        return self._send_layers(self.mapper.shown.renew())
+        """Send what is shown of the past if it is outdated; returns whether there was anything to send. If it
+        is played and was sent, go on to the next time."""
+        sent = self._send_layers(self.mapper.shown.renew())
+        span = self._time_span() if self._playing and not sent else None
+        if span is not None and span.shown_s is not None:
+            later_s = span.shown_s + (span.now_s - span.first_s) / PLAY_STEPS
+            play = later_s < span.now_s
+            self.show_time(later_s if play else None, play)
+        return sent
 
     def decide(self, between: Callable[[], object]) -> None:
         """Show what is occupied; ``between`` is called after each keyframe."""
@@ -313,8 +326,11 @@ class Run(SessionCore):
         self.version += bool(layers)
         return bool(layers)
 
+    def _time_span(self) -> TimeSpan | None:
+        return time_span(self.mapper.shown, self.mapper.roster.entries.values())
+
     def _send_time(self) -> None:
-        span = time_span(self.mapper.shown, self.mapper.roster.entries.values())
+        span = self._time_span()
         if span is not None:
             self.send(span)
 

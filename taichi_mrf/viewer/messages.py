@@ -405,9 +405,11 @@ class Watch(Request):
 
 @dataclass(frozen=True)
 class ShowTime(Request):
-    """Show the map as it was believed at a time in seconds, None for now."""
+    """Show the map as it was believed at a time in seconds, None for now; ``play`` goes on from there to
+    later times, until now."""
 
     stamp_s: float | None
+    play: bool = False
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.run import PLAY_STEPS
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.shown_map import ShownMap
@@ -133,6 +134,28 @@ def test_an_edit_returns_to_now() -> None:
     m = finished(session)
     assert link.of_type(TimeSpan)[-1].shown_s is None
     assert shown(link.sent).voxels() == voxels(m)
+
+
+def test_the_past_is_played_until_now_or_an_edit() -> None:
+    link = FakeLink()
+    session = session_of(link, visited(), DATED)
+    m = finished(session)
+    for edit in (None, Switch(0, on=False)):
+        before = len(link.of_type(TimeSpan))
+        link.ask(ShowTime(START_S + EMPTY - 1, play=True))
+        finished(session)
+        for step in range(4 * PLAY_STEPS):
+            session._extras.work(lambda step: True)
+            if step == 20 and edit is not None:
+                link.ask(edit)
+                m = finished(session)
+        times = [span.shown_s for span in link.of_type(TimeSpan)[before:]]
+        past = [time for time in times if time is not None]
+        assert past == sorted(set(past))
+        assert len(past) > 5
+        assert (past[-1] > START_S + FRAMES - 1.2) == (edit is None)
+        assert times[len(past) :] == [None] * (len(times) - len(past)) != []
+        assert shown(link.sent).voxels() == voxels(m)
 
 
 def test_a_saved_map_is_done_at_once_with_what_moves_and_its_past_brings_its_messages(tmp_path: Path) -> None:

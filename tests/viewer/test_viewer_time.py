@@ -10,6 +10,7 @@ from handled_page import HandledPage
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.live.panel import PLAY_TIME
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, ViewOptions
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
@@ -62,6 +63,14 @@ def test_the_past_begins_at_the_newest_frozen_keyframe(running: TimePage) -> Non
     running.span(9.0, first_s=4.04)
     assert (running.time.slider.min, running.time.slider.max) == (4.0, 9.0)
     assert running.move_to(4.0) == m.ShowTime(START_S + 4.04)
+
+
+def test_time_is_played_from_the_slider_or_from_the_first_keyframe(running: TimePage) -> None:
+    running.span(9.0, first_s=4.04)
+    for chosen_s, begin_s in ((9.0, 4.04), (6.5, 6.5)):
+        running.move_to(chosen_s)
+        running.page.actions[PLAY_TIME](0)
+        assert running.asked[-1] == m.ShowTime(START_S + begin_s, play=True)
 
 
 def test_the_list_says_what_happened_and_when(running: TimePage) -> None:

@@ -89,7 +89,7 @@ POSITION_STEP_M = 0.01
 _MAP_OPTIONS = (
     "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "show_baseline",
 )  # fmt: skip
-TIME_STEP_S = 0.1
+TIME_STEP_S, PLAY_TIME = 0.1, "Play through time"
 
 
 class Panel(BasePanel):
@@ -346,12 +346,17 @@ class TimeFolder:
             self.slider = panel.watch(
                 gui.add_slider("Time (s)", least, most, TIME_STEP_S, now, disabled=True, hint=hint)
             )
+            self._play = panel.add_button(
+                PLAY_TIME,
+                "Show the map from this time on, or from its first keyframe, until now.",
+                disabled=True,
+            )
             self._list = gui.add_html("", visible=False)
 
     def begin(self, has_dates: bool) -> None:
         """Start with an empty map; the folder is there if it ``has_dates``."""
         self._span, self._latest = None, ()
-        self.slider.disabled = True
+        self.slider.disabled = self._play.disabled = True
         self.folder.visible = has_dates
         self._show_list()
 
@@ -361,6 +366,11 @@ class TimeFolder:
             return None
         return max(self._span.first_s, self._span.start_s + float(self.slider.value))
 
+    def played_s(self) -> float | None:
+        """The stamp of the time from which the map is played."""
+        chosen_s = self.chosen_s()
+        return self._span.first_s if chosen_s is None and self._span is not None else chosen_s
+
     def show_span(self, span: m.TimeSpan) -> None:
         """Set the slider's ends, and the time that is shown."""
         known, self._span = self._span is not None, span
@@ -369,6 +379,7 @@ class TimeFolder:
         shown_s = last_s if span.shown_s is None else _on_grid(span.shown_s - span.start_s)
         disabled = span.now_s <= span.first_s
         change(self.slider, min=first_s, max=last_s, value=shown_s, disabled=disabled)
+        change(self._play, disabled=disabled)
         if not known:
             self._show_list()
 
