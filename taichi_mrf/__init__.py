@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from taichi_mrf.session.own_loop import show as show
     from taichi_mrf.system.runtime import init as init
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 taichi_environment.prepare()
 
