@@ -342,10 +342,9 @@ class TimeFolder:
                 "Show the map as it was believed at this time, in all browsers. The right end is now "
                 "and follows new keyframes. An edit returns to now."
             )
-            least, most, now = 0.0, TIME_STEP_S, TIME_STEP_S
-            self.slider = panel.watch(
-                gui.add_slider("Time (s)", least, most, TIME_STEP_S, now, disabled=True, hint=hint)
-            )
+            step = TIME_STEP_S
+            slider = gui.add_slider("Time (s)", 0.0, step, step, step, disabled=True, hint=hint)
+            self.slider = panel.watch(slider)
             self._play = panel.add_button(
                 PLAY_TIME,
                 "Show the map from this time on, or from its first keyframe, until now.",
