@@ -46,9 +46,9 @@ class LivePage:
         browser: bool = False,
         link: Link | None = None,
     ) -> None:
-        """Start the page of a map ``m``, which is not changed. If ``port`` is busy, another one is taken; 0
-        is any. ``browser`` opens one, and warns of the address if there is none. Raises ArgumentTypeError if
-        ``m`` is no map that keyframes can be added to, and ViewerError if the page cannot be served."""
+        """Serve the page of a map ``m``. If ``port`` is busy, another one is taken; 0 takes any. ``browser``
+        opens the page, and warns with its address if there is no browser. Raises ArgumentTypeError if
+        keyframes cannot be added to ``m``, and ViewerError if the page cannot be served."""
         if not hasattr(m, "add_keyframe"):
             raise ArgumentTypeError(f"m must be a map that takes keyframes, such as MRFMap, not {shown(m)}")
         self.url, self._revision = "", -1
@@ -67,9 +67,9 @@ class LivePage:
             warnings.warn(f"no browser can be opened here; the map is at {self.url}", stacklevel=2)
 
     def update(self) -> bool:
-        """Show what has been done to the map since the last call, and carry out what the page's users have
-        asked for; returns False once the page has ended. Call it after each keyframe, or every few. A call
-        that finds nothing done finds what is occupied, and the measured surface.
+        """Show the map's changes since the last call, and carry out the requests of the page's users; returns
+        False once the page has ended. Call it after each keyframe, or every few. If nothing has changed, it
+        updates the occupied voxels and the measured surface.
         """
         run = self._session.state
         run.look_at_keyframes()
