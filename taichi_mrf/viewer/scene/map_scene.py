@@ -213,10 +213,10 @@ class MapScene:
             if map_changed:
                 self._draw_bricks(options.bricks)
                 self._draw_changes(options.color_by == "changes")
-                self._show_space(options, up)
             if any_changed:
                 self._draw_cut(None if both else look.cut, crossed)
                 self.layers["baseline"].place(np.zeros(3) if look.cut else self._baseline_m(up))
+                self._show_space(options, up)
                 self._draw_names(up, cuts if both else None)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
