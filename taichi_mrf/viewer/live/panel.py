@@ -100,7 +100,7 @@ class Panel(BasePanel):
         self._names: dict[str, int] = {}
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
-        hint = "Map another one of the folder; what is not saved is lost, after a question."
+        hint = "Map another recording of this folder; unsaved changes are asked about first."
         self.recording = self.watch(gui.add_dropdown("Recording", [""], visible=False, hint=hint))
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
