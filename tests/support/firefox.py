@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -49,7 +50,7 @@ class Firefox:
         (folder / "user.js").write_text("\n".join(lines))
         self.problems: list[str] = []
         self._calls = 0
-        self._begun: list[subprocess.Popen[str]] = []
+        self._open = ExitStack()
         try:
             self._session = self._begin(folder)
             self._call("session.new", capabilities={})
@@ -59,7 +60,7 @@ class Firefox:
             self._call("browsingContext.setViewport", context=self._page, viewport=size)
             self._call("browsingContext.navigate", context=self._page, url=address, wait="complete")
         except BaseException:
-            self._end()
+            self._open.close()
             raise
 
     def __enter__(self) -> "Firefox":
@@ -68,7 +69,7 @@ class Firefox:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end()
+        self._open.close()
 
     def look(self) -> dict[str, Any]:
         """The page's words and what is in its scene, as browser.Seen has them."""
@@ -91,22 +92,28 @@ class Firefox:
         """Start the screen and the browser, and connect to it."""
         number, chosen = os.pipe()
         screen = ["Xvfb", "-displayfd", str(chosen), "-screen", "0", f"{SIZE[0]}x{SIZE[1] + 100}x24"]
-        self._begun.append(subprocess.Popen(screen, pass_fds=[chosen], stderr=subprocess.DEVNULL, text=True))
+        self._start(screen, pass_fds=[chosen], stderr=subprocess.DEVNULL)
         os.close(chosen)
         with os.fdopen(number) as numbers:
             display = numbers.readline().strip()
         program = ["firefox-esr", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]
         around = os.environ | {"DISPLAY": f":{display}", "HOME": str(folder), "LIBGL_ALWAYS_SOFTWARE": "1"}
-        browser = subprocess.Popen(
-            program, env=around, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
-        self._begun.append(browser)
+        browser = self._start(program, env=around, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         said: list[str] = []
         threading.Thread(target=lambda: said.extend(browser.stderr or ()), daemon=True).start()
-        wait_for(lambda: re.search(r"ws://\S+", "".join(said)), lambda: f"Firefox; it said {said}")
-        found = re.search(r"ws://\S+", "".join(said))
-        assert found is not None
-        return connect(f"{found.group()}/session", max_size=None)
+
+        def address() -> str:
+            return next(iter(re.findall(r"ws://\S+", "".join(said))), "")
+
+        found = wait_for(address, lambda: f"Firefox; it said {said}")
+        return self._open.enter_context(connect(f"{found}/session", max_size=None))
+
+    def _start(self, command: list[str], **options: Any) -> subprocess.Popen[str]:
+        """Start a program that ends with the window."""
+        process = subprocess.Popen(command, text=True, **options)
+        self._open.callback(process.wait)
+        self._open.callback(process.terminate)
+        return process
 
     def _call(self, method: str, **parameters: object) -> Any:
         """Send one command and return its result; what the page logs meanwhile is noted."""
@@ -143,8 +150,3 @@ class Firefox:
         steps += [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
         pointer = {"type": "pointer", "id": "mouse", "actions": steps}
         self._call("input.performActions", context=self._page, actions=[pointer])
-
-    def _end(self) -> None:
-        for process in reversed(self._begun):
-            process.terminate()
-            process.wait()

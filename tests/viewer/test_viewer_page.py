@@ -346,18 +346,28 @@ def test_a_browser_that_connects_while_the_view_follows_follows_too(
     np.testing.assert_allclose(handled.server.get_clients()[client].camera.look_at, [1.0, 0.0, 2.0])
 
 
-def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser: RawClient) -> None:
+def camera_of_a_user(handled: LivePage, browser: RawClient) -> viser.CameraHandle:
+    """The camera of a browser whose user has moved the view to (7, 7, 7)."""
     client = handled.client_id()
     handled.take(Joined(client))
     handled.page.viewpoint.map_grew(np.zeros(3), np.ones(3))
     browser.say(camera_message(position=[7, 7, 7]))
     camera = handled.server.get_clients()[client].camera
     wait_for(lambda: camera.position[0] == 7.0, "the user's viewpoint")
-    bricks, log_odds = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
-    seen = np.ones((1, 512), np.uint8)
-    handled.page.options = replace(ViewOptions(), show_baseline=True)
+    return camera
+
+
+def take_both_maps(handled: LivePage) -> None:
+    """Give the map and the baseline's one occupied brick each."""
     for layer in ("map", "baseline"):
-        handled.take(m.Bricks(layer, bricks, log_odds, seen, np.zeros((0, 3), np.int32)))
+        one = (np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16), np.ones((1, 512), np.uint8))
+        handled.take(m.Bricks(layer, *one, np.zeros((0, 3), np.int32)))
+
+
+def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser: RawClient) -> None:
+    camera = camera_of_a_user(handled, browser)
+    handled.page.options = replace(ViewOptions(), show_baseline=True)
+    take_both_maps(handled)
     handled.page._flush()
     assert handled.page._with_baseline
     np.testing.assert_array_equal(camera.position, [7.0, 7.0, 7.0])
@@ -367,15 +377,9 @@ def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser:
 def test_the_map_of_another_recording_is_looked_at_anew(
     handled: LivePage, browser: RawClient, place: int
 ) -> None:
-    client = handled.client_id()
-    handled.take(Joined(client))
-    handled.page.viewpoint.map_grew(np.zeros(3), np.ones(3))
-    browser.say(camera_message(position=[7, 7, 7]))
-    camera = handled.server.get_clients()[client].camera
-    wait_for(lambda: camera.position[0] == 7.0, "the user's viewpoint")
+    camera = camera_of_a_user(handled, browser)
     handled.take(replace(HELLO, source="/data/desk", recordings=("a recording", "desk"), recording=place))
-    labelled = {"type": "SetGuiPanelLabelMessage", "label": "taichi_mrf: desk"}
-    browser.hear(lambda message: labelled.items() <= message.items())
+    browser.hear_type("SetGuiPanelLabelMessage", label="taichi_mrf: desk")
     handled.page.viewpoint.look_at_everything()
     handled.page.viewpoint.map_grew(np.full(3, 40.0), np.full(3, 41.0))
     kept = np.array_equal(camera.position, [7.0, 7.0, 7.0])
@@ -384,10 +388,7 @@ def test_the_map_of_another_recording_is_looked_at_anew(
 
 @pytest.mark.parametrize("flipped", [False, True])
 def test_a_cut_parts_the_map_from_the_baseline(handled: LivePage, flipped: bool) -> None:
-    bricks, log_odds = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
-    seen = np.ones((1, 512), np.uint8)
-    for layer in ("map", "baseline"):
-        handled.take(m.Bricks(layer, bricks, log_odds, seen, np.zeros((0, 3), np.int32)))
+    take_both_maps(handled)
     at_m = 3.5 * HELLO.voxel_size
     cut = ViewOptions(show_baseline=True, cut_axis="y", cut_at_m=at_m, flip_cut=flipped)
     for options, many in ((ViewOptions(show_baseline=True), (8, 8)), (cut, (5, 3) if flipped else (4, 4))):
