@@ -1,7 +1,7 @@
 """The bricks that exist: the map's index from brick coordinates to slots in the pool.
 
 On CPU and CUDA it is a layer of a Taichi SNode tree, pointer -> pointer -> pointer -> bitmasked: a bitmasked
-cell is a brick, the pointer cell above it a chunk of 8^3 bricks, the one above that a region of 16^3 chunks,
+cell is a brick, the pointer cell above it a chunk of 8^3 bricks, the one above that a region of 32^3 chunks,
 which together span 8192 bricks along each axis, and the uppermost a map. Vulkan has no sparse SNodes, so
 there the same interface is served by dense arrays over a bounded volume. Code outside this file does not
 depend on which of the two is used.
@@ -101,8 +101,11 @@ class _Tree:
     and a process with some ten trees of pointers crashes (Taichi 1.7.4).
     """
 
-    LAYERS, REGIONS, REGION = 256, 64, 16
-    HALF_SPAN = REGIONS * REGION * CHUNK // 2
+    # A node has memory for all of its cells, 16 bytes each, and CUDA has 1 GB for the tree: with layers of
+    # 64^3 regions 190 maps filled it. An odd number of regions puts the world's origin in the middle of one.
+    LAYERS, REGIONS, REGION = 256, 33, 32
+    HALF_SPAN = (REGIONS - 1) * REGION * CHUNK // 2
+    ORIGIN = REGIONS * REGION * CHUNK // 2
 
     def __init__(self) -> None:
         self.slot = ti.field(ti.i32)  # slot + 1, because an inactive cell reads as 0
@@ -120,14 +123,14 @@ class _Tree:
     def cell(self, bricks: Template, i: I32, layer: I32):
         """The cell of brick i of (n, 3) world coordinates in a layer of the tree."""
         return IVec4(
-            bricks[i, 0] + self.HALF_SPAN, bricks[i, 1] + self.HALF_SPAN, bricks[i, 2] + self.HALF_SPAN, layer
+            bricks[i, 0] + self.ORIGIN, bricks[i, 1] + self.ORIGIN, bricks[i, 2] + self.ORIGIN, layer
         )
 
     @ti.func
     def in_span(self, cell: IVec4) -> I32:
         """True if a cell lies within the tree."""
         return ti.min(cell[0], cell[1], cell[2]) >= 0 and (
-            ti.max(cell[0], cell[1], cell[2]) < 2 * self.HALF_SPAN
+            ti.max(cell[0], cell[1], cell[2]) < 2 * self.ORIGIN
         )
 
     @ti.kernel
@@ -170,7 +173,7 @@ class _Tree:
             for axis in ti.static(range(3)):
                 place = ti.floor(ti.cast(points[i, axis], ti.f64) / voxel_size)
                 voxel[axis] = ti.cast(ti.min(ti.max(place, -FARTHEST), FARTHEST), ti.i32)
-            brick = (voxel >> 3) + self.HALF_SPAN
+            brick = (voxel >> 3) + self.ORIGIN
             cell = IVec4(brick[0], brick[1], brick[2], layer)
             found = UNSEEN
             if self.in_span(cell):
@@ -185,7 +188,7 @@ class _Tree:
     def drop_chunks(self, chunks: AnyArray, number: I32, layer: I32):
         """Deactivate ``number`` chunks (n, 3) of a layer."""
         for i in range(number):
-            half = self.HALF_SPAN // CHUNK
+            half = self.ORIGIN // CHUNK
             chunk = IVec4(chunks[i, 0] + half, chunks[i, 1] + half, chunks[i, 2] + half, layer)
             if ti.is_active(self.chunks, chunk):
                 ti.deactivate(self.chunks, chunk)
@@ -227,7 +230,7 @@ class SparseTopology:
         if not SparseTopology.tree.unused:
             raise CapacityError(f"there are {_Tree.LAYERS} maps already, the most that a process can have")
         self._tree = SparseTopology.tree
-        self.layer = self._tree.unused.pop(0)
+        self.layer = self._tree.unused.pop()
         weakref.finalize(self, self._tree.unused.append, self.layer)
         self.clear()  # the map that used the layer before left its bricks in it
 

@@ -213,7 +213,7 @@ def test_as_many_maps_as_there_are_layers_stay_apart(backend: str) -> None:
     if backend == "vulkan":
         pytest.skip("Vulkan has no sparse SNodes")
     bricks = block((0, 0, 0))
-    kept = [SparseTopology() for _ in range(20)]
+    kept = [SparseTopology() for _ in range(200)]
     for number, topology in enumerate(kept):
         topology.insert(bricks, np.full(len(bricks), number, np.int32))
     for number, topology in enumerate(kept):
@@ -231,7 +231,7 @@ def test_a_layer_can_be_had_again_and_is_empty_then(backend: str) -> None:
         assert (topology.slots(bricks) == -1).all()
         topology.insert(bricks, np.arange(len(bricks), dtype=np.int32))
         del topology
-    assert len(used) <= 256
+    assert len(used) == 1
 
 
 def test_more_maps_than_layers_are_an_error(backend: str) -> None:
