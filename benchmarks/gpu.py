@@ -5,7 +5,7 @@
 Runs the tests that use a backend, then measures, on frames of 640 x 480 of the built-in room, made on the
 fly: a new keyframe with three sweeps at 2 and 1 cm (kernels by Taichi's profiler, and wall time), the share
 of the memory's bandwidth that its kernels achieve, full inference of 100 keyframes at 1 cm, how often the
-host waits for the device, and OctoMap on one CPU core. Each part is a process of its own with a time of its
+host waits for the device, distances to obstacles, and OctoMap on one CPU core. Each part is a process of its own with a time of its
 own: a part that fails or takes too long is named, and the others still run. ``--arch cpu --quick`` shows in a
 minute or two that the script works, and nothing else.
 """
@@ -27,7 +27,7 @@ import tyro
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 TARGETS_MS = {0.02: 10.0, 0.01: 25.0}
-FULL_TARGET_S, OCTOMAP_TARGET = 3.0, 100.0
+FULL_TARGET_S, OCTOMAP_TARGET, DISTANCES_TARGET_MS = 3.0, 100.0, 1.0
 TESTS = (
     "sum_product",
     "accumulators",
@@ -59,7 +59,7 @@ class Options:
     """Write all figures to this file as well."""
 
     part: str = ""
-    """Do this part alone, in this process: tests, kernels, wall or octomap."""
+    """Do this part alone, in this process: tests, kernels, wall, distances or octomap."""
 
     @property
     def voxel_sizes(self) -> tuple[float, ...]:
@@ -79,7 +79,7 @@ class Options:
 def run_all(options: Options) -> int:
     """Run each part within its time and print one table. 0 if all of them succeeded."""
     begin, report = time.perf_counter(), {}
-    for name, seconds in (("tests", 150), ("kernels", 100), ("wall", 130), ("octomap", 90)):
+    for name, seconds in (("tests", 150), ("kernels", 100), ("wall", 130), ("distances", 60), ("octomap", 90)):
         report[name] = _run_part(options, name, seconds)
         print(f"{name}: {report[name].get('problem') or 'done'}", flush=True)
     report["seconds"] = time.perf_counter() - begin
@@ -191,6 +191,37 @@ def _sweep_again(m: Any, keyframe: Any) -> None:
         m.infer(sweeps=1, keyframes=[keyframe.id])
 
 
+def distances(options: Options) -> dict[str, Any]:
+    """Distances to obstacles at 10,000 points, and their update after a new keyframe, at the coarser voxels."""
+    import numpy as np
+
+    from taichi_mrf.benchmark.keyframe_cost import Seconds, timed
+    from taichi_mrf.config.schema import Config
+    from taichi_mrf.methods.mrf.map import MRFMap
+    from taichi_mrf.queries.distance import DistanceField
+
+    device = _start(options)
+    size, frames = max(options.voxel_sizes), _frames(options, 4 if options.quick else 18)
+    m = MRFMap.from_config(Config(voxel_size=size), frames[0].camera)
+    field, decided, updated = None, [], []
+    for frame in frames:
+        m.renew([m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)])
+        decided.append(timed(m.decide))  # which voxels are occupied
+        field = field or DistanceField(m, max_distance_m=25 * size)
+        updated.append(timed(field.update))
+    assert field is not None
+    points = np.random.default_rng(0).uniform((-2, -2, 0), (2, 2, 2), (10_000, 3)).astype(np.float32)
+    read = Seconds.median([timed(lambda: field.distance(points)) for _ in range(10)])
+    half = len(frames) // 2
+    return {
+        "device": device,
+        "voxel_size": size,
+        "read_seconds": read.wall,
+        "decide_seconds": Seconds.median(decided[half:]).wall,
+        "update_seconds": Seconds.median(updated[half:]).wall,
+    }
+
+
 def octomap(options: Options) -> dict[str, Any]:
     """OctoMap on one CPU core, a ray for each pixel, at the finest voxel size."""
     from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
@@ -251,6 +282,14 @@ def _table(report: dict[str, Any], options: Options) -> list[str]:
                 f"{_cm(row)}: OctoMap on one core {octo['seconds'] * 1e3:.0f} ms a frame, "
                 f"{octo['seconds'] / row['seconds']:.0f} times a keyframe's (target: {OCTOMAP_TARGET:g})"
             )
+    if "read_seconds" in report["distances"]:
+        found = report["distances"]
+        lines.append(
+            f"{_cm(found)}: distances at 10,000 points {found['read_seconds'] * 1e3:.2f} ms"
+            f"{_target(DISTANCES_TARGET_MS, 'ms')}; after a keyframe their update takes "
+            f"{found['update_seconds'] * 1e3:.1f} ms, and which voxels are occupied "
+            f"{found['decide_seconds'] * 1e3:.1f} ms"
+        )
     for name, part in report.items():
         if isinstance(part, dict) and "problem" in part:
             lines.append(f"{name}: {part['problem']}")
@@ -271,6 +310,7 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
     "tests": tests,
     "kernels": kernels,
     "wall": wall,
+    "distances": distances,
     "octomap": octomap,
 }
 
