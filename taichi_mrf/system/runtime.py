@@ -13,7 +13,6 @@ import platform
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import taichi_mrf
@@ -204,30 +203,11 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
             allow_software = all(device.software for device in devices.vulkan_devices())
             index = devices.best_vulkan_device(allow_software).index
             ti._lib.core.set_vulkan_visible_device(str(index))
-        before = _threads()
         try:
             ti.init(arch=arch, debug=debug, log_level=ti.ERROR, enable_fallback=False, **options)
         except RuntimeError as error:
             why = " ".join(str(error).split())
             raise BackendError(f"{compiler.title()} does not start on it: {why}") from error
-    limited = threads or any(f"{each}_CPU_MAX_NUM_THREADS" in os.environ for each in ("TI", "QD"))
-    if name == "cpu" and not limited:  # processes that share a machine have some threads each, on any core
-        _spread(sorted(_threads() - before)[-devices.cores() :])
-
-
-def _threads() -> set[int]:
-    """The ids of this process's threads, on Linux."""
-    tasks = Path("/proc/self/task")
-    return {int(task.name) for task in tasks.iterdir()} if tasks.is_dir() else set()
-
-
-def _spread(threads: list[int]) -> None:
-    """Bind each thread of the pool, which is started last, to a core. Linux wakes all on the core of the one
-    that calls, and moves them apart after milliseconds, as long as a kernel takes."""
-    cores = sorted(os.sched_getaffinity(0)) if threads else []
-    with contextlib.suppress(OSError):  # a container may forbid it
-        for thread, core in zip(threads, cores, strict=False):
-            os.sched_setaffinity(thread, {core})
 
 
 def _usable(threads: int) -> int:

@@ -214,23 +214,3 @@ def test_profiling_is_refused_once_taichi_runs_without_its_profiler() -> None:
         pytest.skip("on Vulkan launches are timed instead of kernels")
     with pytest.raises(BackendError, match="without its kernel profiler"):
         runtime.init(profile=True)
-
-
-THREADS = """
-import os
-from taichi_mrf.system import runtime
-mine = os.sched_getaffinity(0)
-before = set(os.listdir("/proc/self/task"))
-runtime.init("cpu", %d)
-cores = [os.sched_getaffinity(int(task)) for task in set(os.listdir("/proc/self/task")) - before]
-bound = sorted(core for each in cores if len(each) == 1 for core in each)
-print(bound == sorted(mine), len(bound), os.sched_getaffinity(0) == mine)
-"""
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "sched_getaffinity") or devices.cores() < 2, reason="needs Linux, two cores"
-)
-def test_each_thread_has_a_core_unless_processes_share_the_machine() -> None:
-    assert output(THREADS % 0).split() == ["True", str(devices.cores()), "True"]
-    assert output(THREADS % 1).split() == ["False", "0", "True"]
