@@ -12,6 +12,7 @@ from refusals import refusal
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.system import compiler
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.topology import DenseTopology, SparseTopology, Topology, create_topology, recycle
 
@@ -209,11 +210,15 @@ def test_a_recycled_index_comes_back_empty(backend: str) -> None:
 
 
 def test_as_many_maps_as_there_are_layers_stay_apart(backend: str) -> None:
-    """Ten trees of pointers in one process used to crash it; now all maps share one tree."""
+    """Ten trees of pointers in one process used to crash it, and Quadrants corrupts memory at over 2,048
+    SNodes (its issue 815); now all maps share one tree."""
     if backend == "vulkan":
         pytest.skip("Vulkan has no sparse SNodes")
     bricks = block((0, 0, 0))
-    kept = [SparseTopology() for _ in range(200)]
+    kept = [SparseTopology()]
+    trees = compiler.program().get_snode_tree_size()
+    kept += [SparseTopology() for _ in range(199)]
+    assert compiler.program().get_snode_tree_size() == trees
     for number, topology in enumerate(kept):
         topology.insert(bricks, np.full(len(bricks), number, np.int32))
     for number, topology in enumerate(kept):
