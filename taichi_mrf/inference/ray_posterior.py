@@ -9,6 +9,8 @@ is the probability that voxel i made the measurement: the ray reached it, it is 
 measurement. ``beyond`` is what lies past the end of the map, o the density of a measurement that no surface
 made.
 
+In front of all their surfaces the rays of a group have one way in common, as for messages (ray_list.py).
+
 What is done with a ray's posterior is up to a :class:`RayVisitor`. There are three: the surface counts rays
 by the chance that they met one (surface_rays.py), colours go to the voxels that pixels saw (voxel_colors.py),
 and rays vote for their likeliest voxel (surface_votes.py).
@@ -18,9 +20,9 @@ import math
 from dataclasses import dataclass
 
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
 from taichi_mrf.inference.ray_model import RayModel, log_pass
-from taichi_mrf.inference.sum_product import crossing
+from taichi_mrf.inference.sum_product import crossing, passage
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, log_let_through
@@ -135,43 +137,89 @@ def follow_rays(
     model: RayModel, swept: FreeLogs, workers: Workers, visitor: RayVisitor,
 ) -> None:  # fmt: skip
     """Follow the rays of a keyframe for a visitor. ``space`` and ``swept`` hold the bricks that they meet. A
-    worker follows one ray after the other."""
+    worker follows one group of rays after the other."""
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
     for iteration in range(workers.number * workers.spread):
         worker = iteration // workers.spread
         turns = 0
         if iteration % workers.spread == 0:
-            turns = workers.turns(rays.number)
+            turns = workers.turns(rays.group_number)
         for turn in range(turns):
-            i = workers.ray(worker, turn)
-            wanted = 0
-            if i < rays.number:
-                wanted = visitor.wants(rays, i)
-            if wanted == 1:
-                measured = rays.depth[i]
-                ray, noise, pixels = listed_ray(rays, i, sensor, view)
+            group = workers.ray(worker, turn)
+            if group < rays.group_number:
+                # In front of all surfaces of the group only the visibility changes, on the way in common.
+                middle = block_ray(rays.groups[group], sensor, view)
+                apart = way_in_common(rays, group, middle, 0.0, model.max_depth)
+                visibility = _visibility_at(apart, middle, space, model, swept)
+                for i in range(rays.first[group], rays.first[group + 1]):
+                    if visitor.wants(rays, i) == 1:
+                        measured = rays.depth[i]
+                        ray, noise, pixels = listed_ray(rays, i, sensor, view)
 
-                # The ray ends where its measurement carries no more evidence, or where the map ends.
-                to_voxels = ray.direction.norm()
-                reach = visitor.reach(sensor, model, measured, noise, to_voxels)
-                support, last = reach[0], reach[1]
-                begin, end = 0.0, ti.min(last, model.max_depth)
-                clip(ray, begin, end, space.lower, space.upper)
+                        # The ray ends where its measurement carries no more evidence, or where the map ends.
+                        to_voxels = ray.direction.norm()
+                        reach = visitor.reach(sensor, model, measured, noise, to_voxels)
+                        support, last = reach[0], reach[1]
+                        begin, end = 0.0, ti.min(last, model.max_depth)
+                        clip(ray, begin, end, space.lower, space.upper)
 
-                sight = Sight(
-                    model, swept, sensor, measured, noise, support,
-                    to_voxels, pixels, i, rays.blocks[i], worker, ray, begin, end, reach, space,
-                )  # fmt: skip
-                ahead = visitor.begin(sight)
-                walk_bricks(
-                    ray, begin, end, space.shape, space.chunks, True, _see_brick, ahead,
-                    InBricks(space, _see, _Visited(sight, visitor)),
-                )  # fmt: skip
-                beyond = 0.0
-                if end < last:
-                    beyond = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
-                visitor.end(ahead, sight, beyond)
+                        sight = Sight(
+                            model, swept, sensor, measured, noise, support,
+                            to_voxels, pixels, i, rays.blocks[i], worker, ray, begin, end, reach, space,
+                        )  # fmt: skip
+                        ahead = visitor.begin(sight)
+                        ahead.visibility = visibility
+                        own = ti.max(begin, apart)  # a name of its own: the sight keeps ``begin``
+                        walk_bricks(
+                            ray, own, end, space.shape, space.chunks, True, _see_brick, ahead,
+                            InBricks(space, _see, _Visited(sight, visitor)),
+                        )  # fmt: skip
+                        beyond = 0.0
+                        if end < last:
+                            beyond = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+                        visitor.end(ahead, sight, beyond)
+
+
+@dataclass(frozen=True)
+class _Passed(Bundle):
+    """A ray that passes in front of all surfaces."""
+
+    model: RayModel
+    swept: FreeLogs
+    voxels_per_depth: F32
+
+
+@ti.func
+def _visibility_at(depth: F32, ray: Template, space: Template, model: Template, swept: Template):
+    """vis of what lies at a depth, in front of which no surface made a measurement."""
+    begin, end = 0.0, depth
+    clip(ray, begin, end, space.lower, space.upper)
+    ahead = Ahead(1.0, 0.0)
+    walk_bricks(
+        ray, begin, end, space.shape, space.chunks, True, _pass_brick, ahead,
+        InBricks(space, _pass, _Passed(model, swept, ray.direction.norm())),
+    )  # fmt: skip
+    return ahead.visibility
+
+
+@ti.func
+def _pass_brick(ahead: Template, inside: Template, ray: Template, brick: IVec3, near: F32, far: F32):
+    """One brick in front of all surfaces."""
+    slot, closed = inside.space.bricks[flat(brick, inside.space.shape)], 0
+    if slot >= 0:
+        closed = inside.context.swept.closed[slot]
+    if closed == 1:
+        cross_brick(ahead, inside, ray, brick, near, far)
+    return 1
+
+
+@ti.func
+def _pass(ahead: Template, passed: Template, voxel: I32, near: F32, far: F32):
+    """One voxel in front of all surfaces."""
+    _, log_free = passage(passed, voxel, near, far)
+    ahead.visibility *= exp_of_negative(log_free)
+    return 1
 
 
 @dataclass(frozen=True)
