@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -131,6 +132,7 @@ with tm.live(m, port=0) as page:
     for i in range(3):
         m.renew([m.add_keyframe(np.full((24, 32), 2, np.float32), np.eye(4), camera)])
         print(page.update(), page.url, flush=True)
+        input()
 tm.show(m, port=0, browser=False)
 print("ended", flush=True)
 """
@@ -141,11 +143,13 @@ def test_a_script_without_a_guard_has_a_page(tmp_path: Path) -> None:
     """Its main module is not run again by the page's process, and Ctrl-C ends what shows the map."""
     path = tmp_path / "loop.py"
     path.write_text(SCRIPT)
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, path], **pipes) as run:
+    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, path], text=True, **pipes) as run, ExitStack() as stack:
+        stack.callback(run.kill)  # a failure would wait for its end
         words = run.stdout.readline().split()
         assert words[0] == "True"
         assert urllib.request.urlopen(words[1]).status == 200
+        print("\n\n", file=run.stdin, flush=True)  # it waits after each keyframe
         assert [run.stdout.readline().split() for _ in range(2)] == [words, words]
         warning = run.stderr.readline()
         assert urllib.request.urlopen(warning.split()[-1]).status == 200
