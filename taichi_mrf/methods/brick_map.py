@@ -101,11 +101,6 @@ class BrickMap(Owned):
     seen_free_log_odds: float
     """Log-odds of a place that rays cross but that has no brick."""
 
-    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
-        """Make the empty map of a whole configuration, which describes the noise unless it is given. Every
-        constructor ends here; subclasses extend it."""
-        raise NotImplementedError
-
     def _make_bricks(
         self,
         config: Config,
@@ -153,6 +148,10 @@ class BrickMap(Owned):
         return self._up
 
     if TYPE_CHECKING:  # each method has its own
+
+        def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
+            """Make the empty map of a whole configuration, which describes the noise unless it is given.
+            Every constructor ends here; subclasses extend it."""
 
         def add_keyframe(self, *arguments: Any, **keywords: Any) -> int: ...
 

@@ -48,19 +48,20 @@ class _Record(RayVisitor):
     @ti.func
     def end(self, ahead: Template, sight: Template, beyond: F32):  # noqa: ANN202 (Taichi takes no None)
         # Added, not assigned: an array that is not read comes back from Vulkan undefined where no ray writes.
-        self.found[3 * sight.number] += ahead.explained
-        self.found[3 * sight.number + 1] += ahead.visibility
-        self.found[3 * sight.number + 2] += beyond
+        self.found[4 * sight.number] += ahead.explained
+        self.found[4 * sight.number + 1] += ahead.visibility
+        self.found[4 * sight.number + 2] += beyond
+        self.found[4 * sight.number + 3] += sight.begin
 
 
 def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
-    """Notes of the visitor on the map's only keyframe, by voxels of the pool and by rays."""
-    (k,) = m.keyframes.values()
+    """Notes of the visitor on the map's last keyframe, by voxels of the pool and by rays."""
+    *_, k = m.keyframes.values()
     pool, window, index = m.view.pool, k.footprint.window, WindowIndex()
     index.fill(window, k.visible.cells, k.visible.slots)
     model = m._parts.sweeper.model()
     here = np.zeros(pool.capacity * VOXELS, np.float32)
-    found = np.zeros((k.ray_list.number, 3), np.float32)
+    found = np.zeros((k.ray_list.number, 4), np.float32)
     follow_rays(
         k.ray_list, k.image.sensor,
         window.viewpoint(k.T_world_camera), index.space(window), model, FreeLogs.of(pool, model),
@@ -121,7 +122,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass
                 expected[segment.voxel] = expected.get(segment.voxel, 0.0) + one
                 explained += one
                 visibility *= free
-        wanted = [explained, visibility, visibility * ray.beyond] if number % 2 == 0 else [0.0] * 3
+        wanted = [explained, visibility, visibility * ray.beyond, 0.0] if number % 2 == 0 else [0.0] * 4
         np.testing.assert_allclose(found[number], wanted, rtol=2e-3, atol=1e-5)
     assert here.sum() == pytest.approx(sum(expected.values()), rel=2e-3)
     slots = m.view.pool.in_order
@@ -129,3 +130,34 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass
     assert sorted(by_voxel[by_voxel > 1e-4]) == pytest.approx(
         sorted(v for v in expected.values() if v > 1e-4), rel=5e-3, abs=1e-4
     )
+
+
+def test_rays_see_what_their_way_in_common_lets_through() -> None:
+    """Two keyframes have seen a wall in front of the surface that a third one's rays measure."""
+    camera, sigma, far = PinholeCamera(2, 1, 20.0, 20.0, 0.5, 0.0), 0.03, np.full((1, 2), 1.2, np.float32)
+    config = InferenceConfig(ray_density=1e3)  # both pixels have a ray, and are one group
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
+    rng = np.random.default_rng(7)
+    T = look_along(rng.uniform(-1, 1, 3), rng.normal(size=3), rng)
+    for depth in (np.float32(0.4) * far, np.float32(0.4) * far, far):
+        m.add_keyframe(depth, T, camera)
+    m.infer()
+    group = reference.cast_as_group(far, T, camera, VOXEL, Noise((sigma,)), max_depth=1.5)
+    voxels = sorted(allocated(m))
+    p = dict(zip(voxels, marginals(m, voxels).tolist(), strict=True))
+    closed = {_brick(v) for v in voxels if p[v] > 1.02 * m.prior}
+    visibility, explained = 1.0, 0.0
+    for segment in group.common:
+        if segment.voxel in p and _brick(segment.voxel) in closed:
+            visibility *= (1 - p[segment.voxel]) ** segment.length
+    assert 0.05 < visibility < 0.95
+    ray = group.rays[0]
+    for segment, density in zip(ray.segments, ray.densities, strict=True):
+        if segment.voxel in p:
+            free = (1 - p[segment.voxel]) ** segment.length
+            explained += (1 - free) * density * visibility
+            visibility *= free
+    _, found = _followed(m, 1e9)
+    # A visitor may look at all of the ray: it begins at the camera, not where the rays part.
+    wanted = [explained, visibility, visibility * ray.beyond, 0.0]
+    np.testing.assert_allclose(found[0], wanted, rtol=2e-3, atol=1e-5)
