@@ -308,7 +308,10 @@ def _find_reach(rays: RayList, sensor: Sensor, end_sigmas: F32) -> None:
     for group in range(rays.group_number):
         before = FAR
         for i in range(rays.first[group], rays.first[group + 1]):
-            noise = block_noise(rays.blocks[i], sensor)
-            rays.last[i] = sensor.farthest_depth(rays.depth[i], noise, end_sigmas)
-            before = ti.min(before, sensor.support(rays.depth[i], noise))
+            measured, noise = rays.depth[i], block_noise(rays.blocks[i], sensor)
+            # Both before anything is written: they have much in common.
+            last = sensor.farthest_depth(measured, noise, end_sigmas)
+            support = sensor.support(measured, noise)
+            rays.last[i] = last
+            before = ti.min(before, support)
         rays.support[group] = before

@@ -28,6 +28,12 @@ ABILITIES = {
     "cpu": "sparse map without bounds",
 }
 """The kind of map that each backend supports: Vulkan has no sparse fields."""
+
+FEWER_PASSES = {"cpu": "advanced_optimization", "software": "cfg_optimization"}
+"""The compiler's optimisation that is switched off: nine tenths of the time of compiling, for kernels
+that are no faster (docs/compilers.md). Vulkan cannot do without the advanced one. A GPU keeps both: none
+was at hand to measure."""
+
 SOFTWARE_BLOCK = 8
 """Threads in a block of a software device: in larger ones Mesa's Vulkan skips iterations of long loops."""
 
@@ -193,6 +199,8 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
     ti = _quiet_taichi()
     options: dict[str, Any] = {"cpu_max_num_threads": _usable(threads)} if threads else {}
     options["kernel_profiler"] = profile
+    if passes := FEWER_PASSES.get("software" if software else name):
+        options[passes] = False
     if software:
         options["default_gpu_block_dim"] = SOFTWARE_BLOCK
     arch = getattr(ti, name)
