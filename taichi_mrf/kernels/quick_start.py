@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from taichi_mrf.system import compiler
+from taichi_mrf.system import compiler, compiling
 
 _maker, _method = compiler.note_maker()
 _full_note = getattr(_maker, _method)
@@ -43,6 +43,7 @@ def hasten() -> None:
     arrays = compiler.arrays()
     if hasattr(arrays, "get_traceback"):
         arrays.get_traceback = str
+    compiling.watch()
 
 
 def _note(context: Any, node: ast.stmt | ast.expr) -> str:

@@ -5,6 +5,7 @@ work it reads the page's requests. Requests that arrive faster than they are car
 later one replaces a waiting one of its kind (:class:`WaitingRequests`).
 """
 
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from taichi_mrf.session.link import Link
+from taichi_mrf.system import compiling
 from taichi_mrf.viewer.messages import (
     Freeze,
     Move,
@@ -33,6 +35,10 @@ EDITS = (Switch, Freeze, Move, Reset)
 """Requests that change the map, and so cannot be carried out while it is being inferred."""
 
 OF_ONE_KEYFRAME = (Switch, Freeze, Move)
+
+
+SEND_SECONDS = 0.02
+"""Time in which words leave this process before the compiler of kernels takes Python's lock."""
 
 
 class WaitingRequests:
@@ -115,6 +121,7 @@ class SessionCore:
         self.link, self.policy = link, policy
         self.waiting = WaitingRequests()
         self.ended = False
+        self.compiling = compiling.Waiting(self._show_compiling)
         self.should_stop: Callable[[], bool] = lambda: False
 
     @property
@@ -136,13 +143,14 @@ class SessionCore:
         whether there was any.
         """
         self.should_stop = should_stop
-        while not self.is_over:
-            answer()
-            if self.is_over or work():
-                continue
-            if self.policy.leave_when_done and self.is_done:
-                return
-            self.link.wait(self.idle())
+        with compiling.told(self.compiling):
+            while not self.is_over:
+                answer()
+                if self.is_over or work():
+                    continue
+                if self.policy.leave_when_done and self.is_done:
+                    return
+                self.link.wait(self.idle())
 
     def idle(self) -> float:
         """Show that there is nothing to do; returns for how many seconds to wait at most."""
@@ -155,7 +163,15 @@ class SessionCore:
 
     def send(self, update: Update) -> None:
         """Send an update to the page."""
+        self.compiling.step()
         self.link.send(update)
+
+    def show_activity(self, activity: str, share: float) -> None:
+        """Show the present activity on the page, and the share of it that is done, 0 to 1."""
+
+    def _show_compiling(self, note: str) -> None:
+        self.show_activity(note, 0.0)
+        time.sleep(SEND_SECONDS)
 
     def guarded(self, work: Callable[[], None]) -> bool:
         """Do some work. An error with one frame, one try or one request does not end the session: it is shown

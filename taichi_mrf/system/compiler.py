@@ -45,6 +45,8 @@ class _Compiler:
     """The runtime's attribute that is None before ``ti.init``."""
     kernel: str
     """The module of the class of kernels."""
+    made: str
+    """Attribute of a kernel: what was made of its source, by the types of its arguments."""
     context: str
     """The class that walks through the source of a kernel."""
     note: str
@@ -65,6 +67,7 @@ COMPILERS = {
         runtime="pytaichi",
         program="prog",
         kernel="lang.kernel_impl",
+        made="compiled_kernels",
         context="ASTTransformerContext",
         note="get_pos_info",
         data_type="to_taichi_type",
@@ -79,6 +82,7 @@ COMPILERS = {
         runtime="pyquadrants",
         program="_prog",
         kernel="lang.kernel",
+        made="materialized_kernels",
         context="ASTTransformerFuncContext",
         note="memoized_get_pos_info",
         data_type="to_quadrants_type",
@@ -138,6 +142,12 @@ def program() -> Any:
 def kernel_class() -> Any:
     """The class of kernels, whose ``launch_kernel`` is called for each launch."""
     return _inner(COMPILERS[name()].kernel).Kernel
+
+
+def kernels_of(kernel: Any) -> dict[Any, Any]:
+    """What was made of a kernel's source so far, by the types of its arguments."""
+    made: dict[Any, Any] = getattr(kernel, COMPILERS[name()].made)
+    return made
 
 
 def note_maker() -> tuple[Any, str]:

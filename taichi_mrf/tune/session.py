@@ -75,6 +75,10 @@ class TuneSession(SessionCore):
         self.send(t.Activity("waiting: all scores are up to date", 1.0, busy=False))
         return super().idle()
 
+    def show_activity(self, activity: str, share: float) -> None:
+        """Show the present activity on the page, and the share of it that is done, 0 to 1."""
+        self.send(t.Activity(activity, share, busy=True))
+
     def _work(self) -> bool:
         """Do the next piece of work; returns whether there was any."""
         if self._wanted is not None:
@@ -133,7 +137,7 @@ class TuneSession(SessionCore):
 
         def go_on(activity: str, share: float) -> bool:
             prefix = f"{self._search_text()}: " if self._searching else ""
-            self.send(t.Activity(prefix + activity, share, busy=True))
+            self.show_activity(prefix + activity, share)
             self._carry_out_requests()
             return self._newer == began_with and not self.is_over
 

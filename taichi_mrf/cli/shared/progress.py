@@ -21,7 +21,7 @@ from rich.progress import (
 
 from taichi_mrf.cli.options.shared import Verbosity
 from taichi_mrf.cli.shared.terminal import Terminal, printable
-from taichi_mrf.system import taichi_environment
+from taichi_mrf.system import compiling, taichi_environment
 
 LINE_SECONDS = 5.0
 """Time between two lines where there is no terminal."""
@@ -83,8 +83,10 @@ class ProgressBar:
             disable=self._lines or terminal.quiet,
         )
         self._task: TaskID | None = None
-        self._stage, self._keyframes = "", 0
+        self._stage, self._keyframes, self._steps = "", 0, ""
         self._begin = self._last_line = time.monotonic()
+        self._compiling = compiling.Waiting(self._tell_compiling)
+        self._watching = contextlib.ExitStack()
 
     def advance(self, stage: str, done: int, total: int | None, keyframes: int = 0, note: str = "") -> None:
         """``done`` of ``total`` steps of a stage are done; a new stage takes the place of the one before.
@@ -98,14 +100,26 @@ class ProgressBar:
             self._stage, self._keyframes, self._begin = stage, 0, now
             self._task = self._progress.add_task(printable(stage), total=total, note="")
         self._keyframes += keyframes
+        self._compiling.step()
+        self._steps = f"{stage} {done}" + ("" if total is None else f" of {total}")
         note = note or self._rate(now)
         if not self._lines:
             self._progress.update(self._task, completed=done, total=total, note=printable(note))
-        elif self._verbose or now - self._last_line >= LINE_SECONDS:
+        else:
+            self._print(note, now)
+
+    def _print(self, note: str, now: float) -> None:
+        """Print how far the stage is, if it is time for a line."""
+        if self._verbose or now - self._last_line >= LINE_SECONDS:
             self._last_line = now
-            of = "" if total is None else f" of {total}"
             with contextlib.suppress(OSError):  # the reader of the lines is gone: the run continues
-                self._line_terminal.print_line(f"{stage} {done}{of}" + (f", {note}" if note else ""))
+                self._line_terminal.print_line(self._steps + (f", {note}" if note else ""))
+
+    def _tell_compiling(self, note: str) -> None:
+        if self._lines:
+            self._print(note, time.monotonic())
+        elif self._task is not None:
+            self._progress.update(self._task, note=note, refresh=True)
 
     def _rate(self, now: float) -> str:
         seconds = now - self._begin
@@ -113,6 +127,7 @@ class ProgressBar:
 
     def __enter__(self) -> "ProgressBar":
         self._progress.start()
+        self._watching.enter_context(compiling.told(self._compiling))
         return self
 
     def __exit__(
@@ -121,4 +136,5 @@ class ProgressBar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._watching.close()
         self._progress.stop()

@@ -124,14 +124,16 @@ class _Door:
     def _answer(self, pages: Pages, connection: ServerConnection, request: Request) -> Response | None:
         """A page, a refusal, or None to go on with the websocket's handshake."""
         if self.gate is None:
-            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "The viewer is starting.\n")
-        response = answer_page(connection, request, pages)
-        if response is None:
+            response = connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "The viewer is starting.\n")
+            response.headers["Refresh"] = "1"  # a browser asks again by itself
+            return response
+        page = answer_page(connection, request, pages)
+        if page is None:
             reason = refusal(request.headers, self._host)
         else:
             reason = unknown_name(request.headers, self._host)
         if reason is None:
-            return response
+            return page
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {reason}.\n")
 
     async def _welcome(self, handler: Handler, connection: GuardedConnection) -> None:

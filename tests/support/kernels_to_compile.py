@@ -1,0 +1,11 @@
+"""A kernel that no other test launches."""
+
+from taichi_mrf.kernels import bundles  # noqa: F401 (launches are watched)
+from taichi_mrf.kernels.types import F32Array
+from taichi_mrf.system.compiler import ti
+
+
+@ti.kernel
+def double(values: F32Array):  # noqa: ANN201 (Taichi allows no None)
+    for i in range(values.shape[0]):
+        values[i] *= 2.0
