@@ -56,6 +56,9 @@ def _note(context: Any, node: ast.stmt | ast.expr) -> str:
 
 def _is_in_class(statements: Sequence[re.Pattern[str]], level_of_class_stackframe: int) -> bool:
     """True if the frame so far up the stack is at one of the ``statements`` that open a class."""
-    frame = sys._getframe(level_of_class_stackframe)
+    try:
+        frame = sys._getframe(level_of_class_stackframe)
+    except ValueError:  # a kernel at the top of a program
+        return False
     line = linecache.getline(frame.f_code.co_filename, frame.f_lineno, frame.f_globals).strip()
     return any(statement.match(line) for statement in statements)

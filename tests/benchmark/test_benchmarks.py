@@ -45,3 +45,11 @@ def test_the_gpu_script_runs_through_on_a_cpu_and_says_so(repository: Path, tmp_
     assert fine["launches_in_a_sweep"] > 0
     assert fine["waits_in_a_sweep"] == 0  # on a CPU
     assert all(row["kernel_seconds"] > 0 and row["bandwidth_share"] > 0 for row in report["kernels"]["rows"])
+
+
+@pytest.mark.soak
+def test_the_first_run_compiles_no_longer_than_before(repository: Path) -> None:
+    run(
+        repository / "benchmarks" / "first_run.py",
+        "--gate", str(repository / "benchmarks" / "first_run.json"),
+    )  # fmt: skip

@@ -3,6 +3,9 @@
 methods."""
 
 import ast
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,3 +61,19 @@ class Adder:
 @pytest.mark.usefixtures("backend")
 def test_methods_are_known_as_such() -> None:
     assert Adder(3).twice_raised(1) == 7
+
+
+def test_a_program_has_a_kernel_of_its_own_at_its_top(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import taichi_mrf.kernels.bundles\n"
+        "from taichi_mrf.system.compiler import ti\n"
+        "@ti.kernel\n"
+        "def own(x: ti.f32) -> ti.f32:\n"
+        "    return 2.0 * x\n"
+        "import taichi_mrf\n"
+        "taichi_mrf.init('cpu')\n"
+        "print(own(4.0))\n"
+    )
+    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.returncode) == ("8.0\n", 0), done.stderr
