@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _WAY_COLOR = "#e6007e"
 """Magenta: on none of the colour scales."""
 
+_DPI = 120
+
 
 def new_figure(width_in: float, height_in: float) -> "Figure":
     """An empty white figure, sizes in inches."""
@@ -42,6 +44,15 @@ def notice(text: str) -> "Figure":
     figure = new_figure(8.0, 3.0)
     figure.text(0.5, 0.5, text, ha="center", va="center")
     return figure
+
+
+def write_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure that :func:`new_figure` made as a PNG. Raises MapFileError."""
+    figure.set_dpi(_DPI)
+    with atomic_path(path) as temporary:
+        # Figure.savefig would draw everything twice, for files whose layout needs it. Level 2 of 9 takes
+        # half of the default's time, and the files are a fifth larger.
+        figure.canvas.print_png(temporary, pil_kwargs={"compress_level": 2})  # type: ignore[attr-defined]
 
 
 def draw_way(axes: "Axes", points: NDArray[np.floating]) -> None:
@@ -73,7 +84,6 @@ MOST_TILES = 64
 
 _COLUMNS = 4
 _TILE_IN = 4.2
-_DPI = 120
 _LETTERS = 44
 """That fit beside each other on a tile."""
 
@@ -113,8 +123,7 @@ def write_contact_sheet(path: Path, tiles: Sequence[Tile]) -> None:
             axes.imshow(picture)
     if len(shown) < len(tiles):
         figure.suptitle(f"the first {len(shown)} of {len(tiles)} maps")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, pil_kwargs={"compress_level": 2})
+    write_figure(figure, path)
 
 
 def _read(path: Path) -> NDArray[np.uint8] | None:

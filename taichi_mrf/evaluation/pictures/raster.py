@@ -7,9 +7,7 @@ side from which they run counter-clockwise, by edge functions (Pineda 1988). The
 equals, the one that comes first.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +15,17 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array2, F32Array3, I32Array, I32Array2, Template
+from taichi_mrf.kernels.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array2,
+    F32Array3,
+    I32Array,
+    I32Array2,
+    Template,
+    Vec3,
+)
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR
@@ -28,9 +36,6 @@ a common face slip between its neighbours."""
 
 _NEAR_M = 0.01
 """Triangles that reach nearer than this are left out."""
-
-_PIXELS = 1 << 18
-"""Pixels whose triangles are looked at together."""
 
 _NONE = np.iinfo(np.int32).max
 """In place of the number of a shape, and of the bits of a depth, where there is none."""
@@ -61,7 +66,7 @@ def _draw(
 
 def _drawn(
     shapes: "_Cubes | _Triangles", boxes: NDArray[np.int32], camera: PinholeCamera
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """The depth at each pixel, (H * W), NaN where there is nothing, and the shape, -1 for none."""
     depth, index = np.full((2, camera.width * camera.height), _NONE, np.int32)
     if len(boxes):
@@ -69,7 +74,7 @@ def _drawn(
             _draw(shapes, boxes, camera.width, depth, index, numbering)
     met = index < _NONE
     depth_m = np.where(met, depth.view(np.float32), np.float32(np.nan))
-    return depth_m, np.where(met, index, -1).astype(np.int64)
+    return depth_m, np.where(met, index, -1)
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class VoxelImage:
     depth_m: NDArray[np.float32]
     """Axial depth of the point where the ray enters the voxel, NaN where it meets none."""
 
-    index: NDArray[np.int64]
+    index: NDArray[np.int32]
     """Index of that voxel in the list, -1 where there is none."""
 
     normal: NDArray[np.float32]
@@ -179,7 +184,7 @@ class TriangleImage:
     triangle, -1 for none; ``shares`` (H, W, 3) of its three corners at the pixel."""
 
     depth_m: NDArray[np.float32]
-    index: NDArray[np.int64]
+    index: NDArray[np.int32]
     shares: NDArray[np.float32]
 
 
@@ -225,27 +230,34 @@ def cast_triangles(
     seen = (depth > _NEAR_M)[triangles].all(axis=1)
     seen &= (first <= last).all(axis=1) & (last >= 0).all(axis=1) & (first < size).all(axis=1)
     seen &= _twice_areas(corners) < 0
-    rows = np.flatnonzero(seen)
-    bounds = np.clip(np.stack([first[rows], last[rows]], axis=2), 0, size[:, None] - 1)
-    corners = corners[rows]
-    depth_m, index = _drawn(_Triangles(corners), bounds.astype(np.int32).reshape(-1, 4), camera)
+    bounds = np.clip(np.stack([first, last], axis=2), 0, size[:, None] - 1).astype(np.int32).reshape(-1, 4)
+    bounds[~seen] = 0, -1, 0, -1
+    depth_m, index = _drawn(_Triangles(corners), bounds, camera)
     shares = np.zeros((len(index), 3), np.float32)
-    for met in _in_parts(index >= 0):
-        there = corners[index[met]]
-        there[..., :2] -= np.stack([met % camera.width, met // camera.width], axis=1)[:, None]
-        # Shares on the screen become shares in space: nearer corners count more.
-        x, y, nearness = there.transpose(2, 1, 0)
-        near = nearness * np.stack([x[a] * y[b] - x[b] * y[a] for a, b in ((1, 2), (2, 0), (0, 1))])
-        shares[met] = (near / near.sum(axis=0)).T
-        index[met] = rows[index[met]]
+    _share(corners, index, camera.width, shares)
     shape = camera.shape
     return TriangleImage(depth_m.reshape(shape), index.reshape(shape), shares.reshape(*shape, 3))
 
 
-def _in_parts(hit: NDArray[np.bool_]) -> Iterator[NDArray[np.intp]]:
-    """The pixels that are ``hit``, so many at a time that what is computed of them takes some megabytes."""
-    pixels = np.flatnonzero(hit)
-    return (pixels[begin : begin + _PIXELS] for begin in range(0, len(pixels), _PIXELS))
+@kernel
+def _share(corners: F32Array3, index: I32Array, width: I32, shares: F32Array2) -> None:
+    """The ``shares`` (H * W, 3) of the corners of the triangle ``index`` (H * W) at each pixel; ``corners``
+    are those of _Triangles."""
+    for pixel in range(index.shape[0]):
+        i = index[pixel]
+        if i >= 0:
+            away = ti.Matrix.zero(ti.f32, 3, 2)
+            for corner in ti.static(range(3)):
+                away[corner, 0] = corners[i, corner, 0] - pixel % width
+                away[corner, 1] = corners[i, corner, 1] - pixel // width
+            # Shares on the screen become shares in space: nearer corners count more.
+            near = Vec3(0.0)
+            for corner in ti.static(range(3)):
+                a, b = (corner + 1) % 3, (corner + 2) % 3
+                near[corner] = away[a, 0] * away[b, 1] - away[b, 0] * away[a, 1]
+                near[corner] *= corners[i, corner, 2]
+            for corner in ti.static(range(3)):
+                shares[pixel, corner] = near[corner] / near.sum()
 
 
 def _twice_areas(corners: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -297,24 +309,35 @@ def shaded_triangles(
 ) -> NDArray[np.uint8]:
     """Colours and ``normals`` of vertices (V, 3) on their triangles (T, 3) under a far light, on a background
     (H, W, 3), RGB."""
-    hit, picture = image.index >= 0, background.copy()
-    if not hit.any():
-        return picture
-    hollowness = _hollowness(image.depth_m).reshape(-1)
-    for pixels in _in_parts(hit):
-        corners, shares = triangles[image.index.flat[pixels]], image.shares.reshape(-1, 3)[pixels]
-        mixed = _mixed(shares, colors[corners])
-        normal = _mixed(shares, normals[corners])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light.astype(np.float32), 0.0, 1.0)
-        light *= 1.0 - _OCCLUSION * hollowness[pixels]
-        picture.reshape(-1, 3)[pixels] = np.rint(mixed * light[:, None])
-    return picture
+    lit = background.reshape(-1, 3).astype(np.float32)
+    if (image.index >= 0).any():
+        _light(
+            image.index.reshape(-1), image.shares.reshape(-1, 3), triangles.astype(np.int32),
+            colors.astype(np.float32), normals.astype(np.float32),
+            ti.Vector(towards_light.tolist(), ti.f32), _hollowness(image.depth_m).reshape(-1), lit,
+        )  # fmt: skip
+    return lit.astype(np.uint8).reshape(background.shape)
 
 
-def _mixed(shares: NDArray[np.float32], of_corners: NDArray[Any]) -> NDArray[np.float32]:
-    """Values of three corners, (n, 3, 3), mixed by their shares (n, 3)."""
-    return np.einsum("nk,nkc->nc", shares, of_corners.astype(np.float32))
+@kernel
+def _light(
+    index: I32Array, shares: F32Array2, triangles: I32Array2, colors: F32Array2, normals: F32Array2,
+    towards_light: Vec3, hollowness: F32Array, lit: F32Array2,
+) -> None:  # fmt: skip
+    """The colours ``lit`` (H * W, 3), whole numbers, of the pixels in which there is a triangle."""
+    for pixel in range(index.shape[0]):
+        i = index[pixel]
+        if i >= 0:
+            color, normal = Vec3(0.0), Vec3(0.0)
+            for corner in ti.static(range(3)):
+                vertex, share = triangles[i, corner], shares[pixel, corner]
+                color += share * Vec3(colors[vertex, 0], colors[vertex, 1], colors[vertex, 2])
+                normal += share * Vec3(normals[vertex, 0], normals[vertex, 1], normals[vertex, 2])
+            facing = normal.dot(towards_light) / ti.max(normal.norm(), 1e-6)
+            light = _AMBIENT + (1.0 - _AMBIENT) * ti.max(0.0, ti.min(1.0, facing))
+            light *= 1.0 - _OCCLUSION * hollowness[pixel]
+            for channel in ti.static(range(3)):
+                lit[pixel, channel] = ti.round(color[channel] * light)
 
 
 def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

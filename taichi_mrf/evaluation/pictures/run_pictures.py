@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_mrf.evaluation.held_out import depth_error, surface_depth
-from taichi_mrf.evaluation.pictures.figures import new_figure, notice
+from taichi_mrf.evaluation.pictures.figures import new_figure, notice, write_figure
 from taichi_mrf.evaluation.pictures.room_views import (
     DrawnMap,
     DrawnSurface,
@@ -22,12 +22,10 @@ from taichi_mrf.methods.capabilities import measures_surface
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.unrolled import unrolled
-from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_DPI = 120
 _DEPTH_ROWS = 3
 """Frames in the depth picture, at most."""
 
@@ -49,9 +47,7 @@ def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) ->
     """
     figures = {**_whole_map(m), "depth.png": depth_comparison(m, held_out)}
     for name, figure in figures.items():
-        with atomic_path(out_dir / name) as temporary:
-            # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
-            figure.savefig(temporary, dpi=_DPI, pil_kwargs={"compress_level": 2})
+        write_figure(figure, out_dir / name)
     return [out_dir / name for name in figures]
 
 
