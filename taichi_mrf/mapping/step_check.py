@@ -90,7 +90,6 @@ def check_steps(
     if len(ids) < FEWEST_KEYFRAMES:
         return None
     ratios = []
-    # The second of a pair is soon the first of another.
     points_of = cache(lambda i: _points(keyframes[ids[i]], noise, max_depth))
     for first, second in _pairs([keyframes[id] for id in ids], [T_recorded[id] for id in ids]):
         there, points = points_of(first), points_of(second)

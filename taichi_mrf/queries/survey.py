@@ -85,10 +85,9 @@ class SurfaceSurvey:
     """Surfaces that a view's rays meet, all (H, W) float32.
 
     ``near`` and ``far`` bound the ray's segment in the voxel with the largest omega, 0 where the ray meets
-    nothing; ``visibility`` is what is left of the ray at its end. Where rays are judged by measurements,
-    ``expected`` is the mean depth of the surface, given that there is one, 0 where there is none, and
-    ``likelihood`` the density, per metre, of the measurement if the surface is distributed as Omega, 0
-    without a measurement.
+    nothing; ``visibility`` is what is left of the ray at its end; ``expected`` the mean depth of the
+    surface, given that there is one, 0 where there is none and in a rendered view. ``likelihood`` is the
+    density, per metre, of the measurement if the surface is distributed as Omega; 0 without a measurement.
     """
 
     near: NDArray[np.float32]
