@@ -21,6 +21,7 @@ from taichi_mrf.alignment.surfel_grid import SurfelGrid, SurfelPlanes
 from taichi_mrf.alignment.surfels import ROUGHNESS
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.resident import Resident, resident
 from taichi_mrf.kernels.types import I32, F32Array, F32Array2, IVec3, Mat3, Template, Vec3
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
@@ -113,8 +114,8 @@ class PointToPlane:
 
     def __init__(self, points: OrientedPoints, grid: SurfelGrid) -> None:
         self.grid, self.total = grid, len(points.points)
-        positions, normals = _upload(points.points), _upload(points.normals)
-        self._points = _Points(positions, normals, _upload(points.sigmas), self.total)
+        positions, normals = _resident(points.points), _resident(points.normals)
+        self._points = _Points(positions, normals, _resident(points.sigmas), self.total)
         self._strips = _Strips(64, 512) if runtime.active() == "cpu" else _Strips(2048, 1)
 
     def linearised(self, T_world_camera: Pose) -> NormalEquations:
@@ -134,11 +135,8 @@ class PointToPlane:
         )
 
 
-def _upload(values: NDArray[np.float32]) -> "ti.Ndarray":
-    array = ti.ndarray(ti.f32, values.shape if len(values) else (1, *values.shape[1:]))
-    if len(values):
-        array.from_numpy(np.ascontiguousarray(values))
-    return array
+def _resident(values: NDArray[np.float32]) -> Resident:
+    return resident(values if len(values) else np.zeros((1, *values.shape[1:]), np.float32))
 
 
 @ti.func
@@ -148,12 +146,13 @@ def surface_at(P: Vec3, normal: Vec3, surface: Template):
     weight, distance = 0.0, 0.0
     mean = Vec3(0.0)
     base = ti.floor(P, ti.i32)
-    for dx, dy, dz in ti.static(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
+    # A loop, not 27 copies of what is in it, which took seconds to compile.
+    for dx, dy, dz in ti.ndrange((-1, 2), (-1, 2), (-1, 2)):
         cell = base + IVec3(dx, dy, dz)
         if cell.min() >= 0 and (surface.shape * BRICK - cell).min() > 0:
-            brick = surface.bricks[flat(cell // BRICK, surface.shape)]
+            brick = surface.bricks[flat(cell >> 3, surface.shape)]
             if brick >= 0:
-                row = surface.places[brick * VOXELS + voxel_number(cell % BRICK)]
+                row = surface.places[brick * VOXELS + voxel_number(cell & 7)]
                 if row >= 0:
                     planes = ti.static(surface.planes)
                     away = P - Vec3(planes[row, 1], planes[row, 2], planes[row, 3])

@@ -2,9 +2,7 @@
 meets only those that it is measured against."""
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 
 _WITHIN = np.arange(6)
 
@@ -50,6 +48,9 @@ class PoseEquations:
     def step(self, free: NDArray[np.bool_], damping: float = 0.0) -> NDArray[np.float64]:
         """The step (poses, 6): 0 for poses that are not ``free`` (poses,), and for those without any term.
         ``damping`` is Levenberg's, a share of the diagonal."""
+        from scipy import sparse  # slow to import, and few runs need it
+        from scipy.sparse.linalg import splu
+
         size = 6 * self.poses
         if not self._values:
             return np.zeros((self.poses, 6))

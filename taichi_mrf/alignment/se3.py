@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from taichi_mrf.geometry.poses import Pose
 
@@ -35,6 +34,8 @@ def twist(T: Pose) -> NDArray[np.float64]:
 
 def exps(xi: Twists) -> NDArray[np.float64]:
     """(n, 4, 4): the poses exp(xi) of many twists."""
+    from scipy.spatial.transform import Rotation  # slow to import, and few runs need it
+
     T = np.zeros((len(xi), 4, 4))
     T[:, :3, :3] = Rotation.from_rotvec(xi[:, 3:]).as_matrix()
     angle = np.linalg.norm(xi[:, 3:], axis=1)
@@ -49,6 +50,8 @@ def exps(xi: Twists) -> NDArray[np.float64]:
 
 def logs(T: NDArray[np.float64]) -> Twists:
     """(n, 6): the twists of many poses."""
+    from scipy.spatial.transform import Rotation
+
     omega = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
     angle = np.linalg.norm(omega, axis=1)
     safe = np.maximum(angle, _SMALL_OF_MANY)

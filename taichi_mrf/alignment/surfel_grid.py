@@ -6,9 +6,9 @@ import numpy as np
 
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.resident import resident
 from taichi_mrf.kernels.types import F32, F32Array2, I32Array, IVec3
 from taichi_mrf.system import runtime
-from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 
@@ -54,8 +54,7 @@ class SurfelGrid:
             planes[:, 1:4] = self.window.to_voxels(surface.points_m)
             numbers = np.arange(len(bricks), dtype=np.int32)
             self.index.fill(self.window, self.window.cells_of(bricks), numbers)
-        on_device = ti.ndarray(ti.i32, places.shape), ti.ndarray(ti.f32, planes.shape)
-        on_device[0].from_numpy(places)
-        on_device[1].from_numpy(planes)
         runtime.settle()
-        self.planes = SurfelPlanes(self.cell_size, self.window.shape_vector, self.index.bricks, *on_device)
+        self.planes = SurfelPlanes(
+            self.cell_size, self.window.shape_vector, self.index.bricks, resident(places), resident(planes)
+        )

@@ -2,7 +2,7 @@
 it renders.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import PosedDepth
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, without_bias
 
 Render = Callable[[Camera, Pose], NDArray[np.float32]]
@@ -87,11 +88,13 @@ def _residuals(rendered_m: NDArray[np.floating], measured_m: NDArray[np.floating
 @dataclass(frozen=True)
 class HeldOutCheck:
     """The error over ``frames`` held-out frames together; ``skipped`` names the unreadable ones, each with
-    its problem."""
+    its problem. ``kept`` has some of the others by index, each with the depth (H, W) that the map predicts
+    for it, in metres, NaN where there is none."""
 
     error: DepthError
     frames: int
     skipped: dict[str, str]
+    kept: dict[int, tuple[Frame, NDArray[np.float32]]]
 
 
 def check_held_out(
@@ -100,15 +103,17 @@ def check_held_out(
     held_out: Sequence[int],
     on_frame: Callable[[int], None] = lambda number: None,
     render: Render | None = None,
+    keep: Collection[int] = (),
 ) -> HeldOutCheck:
     """Compare the depth that a map predicts at held-out views with the depth measured there, of which the
     sensor's bias is taken.
 
     ``held_out`` are indices of the dataset. ``on_frame`` is called after each with its number from 1.
-    ``render`` predicts depth in place of the map's own ``render_depth``.
+    ``render`` predicts depth in place of the map's own ``render_depth``. The frames ``keep`` are kept.
     """
     predicted = render or m.render_depth
     skipped: dict[str, str] = {}
+    kept: dict[int, tuple[Frame, NDArray[np.float32]]] = {}
 
     def depth_pairs() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float64]]]:
         for number, index in enumerate(held_out, start=1):
@@ -117,11 +122,14 @@ def check_held_out(
             except FrameError as error:
                 skipped[dataset.frame_names[index]] = str(error)
             else:
-                yield predicted(frame.camera, frame.T_world_camera), surface_depth(frame, m.noise)
+                rendered_m = predicted(frame.camera, frame.T_world_camera)
+                if index in keep:
+                    kept[index] = frame, rendered_m
+                yield rendered_m, surface_depth(frame, m.noise)
             on_frame(number)
 
     error = pooled_depth_error(depth_pairs())
-    return HeldOutCheck(error, len(held_out) - len(skipped), skipped)
+    return HeldOutCheck(error, len(held_out) - len(skipped), skipped, kept)
 
 
 def surface_depth(frame: PosedDepth, noise: NoiseModel) -> NDArray[np.float64]:

@@ -20,8 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import log_density
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
@@ -290,22 +288,22 @@ class NoiseCheck:
         return self.law is not None
 
 
+def enough_of(held_out: Sequence[int]) -> Sequence[int]:
+    """Those of the held-out frames that :func:`check_noise` needs."""
+    return held_out[:: max(1, -(-len(held_out) // MOST_FRAMES))]
+
+
 def check_noise(
     m: VoxelMap,
-    dataset: Dataset,
-    held_out: Sequence[int],
+    frames: Iterable[Frame],
     on_frame: Callable[[], None] = lambda: None,
     most: float = DOUBTED,
 ) -> NoiseCheck | None:
-    """Compare the noise of a map with some of the held-out frames, indices of the dataset. None if these do
-    not tell. ``on_frame`` is called after each; ``most`` is the factor from which on sigma is off."""
-    some = held_out[:: max(1, -(-len(held_out) // MOST_FRAMES))]
+    """Compare the noise of a map with some frames that it has not seen. None if these do not tell.
+    ``on_frame`` is called after each; ``most`` is the factor from which on sigma is off."""
     parts: list[Explained] = []
-    for index in some:
-        try:
-            part = explained_frame(m, dataset.read(index))
-        except FrameError:  # check_held_out names it
-            part = None
+    for frame in frames:
+        part = explained_frame(m, frame)
         if part is not None:
             parts.append(part)
         on_frame()

@@ -8,6 +8,7 @@ aligned, depth to depth, and the lengths of their steps compared with the record
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +90,9 @@ def check_steps(
     if len(ids) < FEWEST_KEYFRAMES:
         return None
     ratios = []
+    points_of = cache(lambda i: _points(keyframes[ids[i]], noise, max_depth))
     for first, second in _pairs([keyframes[id] for id in ids], [T_recorded[id] for id in ids]):
-        there, points = (_points(keyframes[ids[i]], noise, max_depth) for i in (first, second))
+        there, points = points_of(first), points_of(second)
         T_first_second = inverse(T_recorded[ids[first]]) @ T_recorded[ids[second]]
         ratio = _ratio(there, points, T_first_second, CELL * _median_depth(keyframes[ids[first]]))
         if ratio is not None:

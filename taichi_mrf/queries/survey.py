@@ -86,8 +86,8 @@ class SurfaceSurvey:
 
     ``near`` and ``far`` bound the ray's segment in the voxel with the largest omega, 0 where the ray meets
     nothing; ``visibility`` is what is left of the ray at its end; ``expected`` the mean depth of the
-    surface, given that there is one, 0 where there is none. ``likelihood`` is the density, per metre, of
-    the measurement if the surface is distributed as Omega; 0 without a measurement.
+    surface, given that there is one, 0 where there is none and in a rendered view. ``likelihood`` is the
+    density, per metre, of the measurement if the surface is distributed as Omega; 0 without a measurement.
     """
 
     near: NDArray[np.float32]
@@ -178,9 +178,9 @@ def survey_voxel(ray: Template, surveyed: Template, voxel: I32, near: F32, far: 
         ray.near = near
         ray.far = far
     here = dim(ray, alpha, near, far)
-    ray.stopped += here
-    ray.moment += here * 0.5 * (near + far)
     if ti.static(surveyed.judged):
+        ray.stopped += here
+        ray.moment += here * 0.5 * (near + far)
         ray.likelihood += here * surveyed.sensor.likelihood(
             ray.measured, near, far, surveyed.noise, surveyed.medium.voxel_size, SEGMENT
         )

@@ -1,7 +1,7 @@
 """Writing the folder of a run. Every run that has made a map leaves the same files, written here."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,7 +17,7 @@ from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out
-from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
+from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise, enough_of
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
@@ -142,11 +142,14 @@ def write_run(
     found, noise = None, None
     if check and posed is not None:
         render = None if chunked is None else partial(render_chunked, chunked)
-        found = _check(result, posed, haste, advance, render)
+        judged, pictured = enough_of(result.held_out), _spread(result.held_out, PICTURED_FRAMES)
+        keep = {*judged, *pictured} if chunked is None else set()
+        found = _check(result, posed, haste, advance, render, keep)
         if found is not None and chunked is None:
             advance("Noise", 0, 1)
             default = is_default_noise(posed, facts.config.sensor)
-            noise = _check_noise(result, posed, haste, DOUBTED if default else CONTRADICTED)
+            frames = [found.kept[index][0] for index in judged if index in found.kept]
+            noise = _check_noise(result, frames, haste, DOUBTED if default else CONTRADICTED)
         if not haste.hurried and not result.interrupted:
             advance("Poses", 0, 1)
             with result.timed("checking"):
@@ -166,7 +169,7 @@ def write_run(
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
-        written += _write_pictures(folder, result, posed, haste, advance)
+        written += _write_pictures(folder, result, posed, found, haste, advance)
     if facts.learnt is not None:
         write_text(folder / NOISE_FILE, sensor_yaml(facts.config.sensor, facts.source, facts.learnt))
         written.append(folder / NOISE_FILE)
@@ -228,7 +231,12 @@ def _write_map(
 
 
 def _check(
-    result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance, render: Render | None
+    result: MappingResult,
+    dataset: Dataset,
+    haste: Haste,
+    advance: Advance,
+    render: Render | None,
+    keep: Collection[int],
 ) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
     if not result.held_out or haste.hurried:
@@ -241,14 +249,16 @@ def _check(
 
     try:
         with result.timed("checking"):
-            check = check_held_out(result.map, dataset, result.held_out, checked, render)
+            check = check_held_out(result.map, dataset, result.held_out, checked, render, keep)
     except CutShortError:
         return None
     result.skipped.update(check.skipped)
     return check
 
 
-def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste, most: float) -> NoiseCheck | None:
+def _check_noise(
+    result: MappingResult, frames: Sequence[Frame], haste: Haste, most: float
+) -> NoiseCheck | None:
     """None if the frames that were held out do not tell, or if the run has to end before they do."""
 
     def checked() -> None:
@@ -257,7 +267,7 @@ def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste, most: fl
 
     try:
         with result.timed("checking"):
-            return check_noise(result.map, dataset, result.held_out, checked, most)
+            return check_noise(result.map, frames, checked, most)
     except CutShortError:
         return None
 
@@ -266,6 +276,7 @@ def _write_pictures(
     folder: Path,
     result: MappingResult,
     dataset: Dataset | None,
+    check: HeldOutCheck | None,
     haste: Haste,
     advance: Advance,
 ) -> list[Path]:
@@ -274,8 +285,12 @@ def _write_pictures(
     try:
         with result.timed("pictures"), haste.cutting_short():
             held_out = _spread(result.held_out, PICTURED_FRAMES)
-            frames = [] if dataset is None else _readable(dataset, held_out)
-            pictures = write_pictures(folder, result.map, frames)
+            if check is not None:
+                kept = [check.kept[index] for index in held_out if index in check.kept]
+                frames, rendered_m = [frame for frame, _ in kept], [depth_m for _, depth_m in kept]
+            else:
+                frames, rendered_m = [] if dataset is None else _readable(dataset, held_out), []
+            pictures = write_pictures(folder, result.map, frames, rendered_m)
     except CutShortError:
         return []
     advance("Drawing", 1, 1)

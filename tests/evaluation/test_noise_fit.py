@@ -102,7 +102,7 @@ def checked(room: Dataset, scale: float) -> NoiseCheck:
     """Check of a map's noise that is a multiple of the right one."""
     config = Config(0.05, sensor=SensorConfig(sigma_scale=scale), evaluation=EvaluationConfig(hold_out=4))
     result = map_sequence(room, config)
-    check = check_noise(result.map, room, result.held_out)
+    check = check_noise(result.map, map(room.read, result.held_out))
     assert check is not None
     assert check.frames == len(result.held_out) == 4
     return check

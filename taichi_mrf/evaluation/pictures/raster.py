@@ -72,9 +72,9 @@ def _drawn(
     if len(boxes):
         for numbering in (0, 1):
             _draw(shapes, boxes, camera.width, depth, index, numbering)
-    met = index < _NONE
-    depth_m = np.where(met, depth.view(np.float32), np.float32(np.nan))
-    return depth_m, np.where(met, index, -1)
+    depth_m, nothing = depth.view(np.float32), index == _NONE
+    depth_m[nothing], index[nothing] = np.nan, -1
+    return depth_m, index
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.held_out import depth_error, surface_depth
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice, write_figure
@@ -26,6 +27,8 @@ from taichi_mrf.sensor.unrolled import unrolled
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Depth = NDArray[np.float32]
+
 _DEPTH_ROWS = 3
 """Frames in the depth picture, at most."""
 
@@ -38,14 +41,17 @@ _LOW = 0.5
 """Height over width of pictures beside which the labels have no room."""
 
 
-def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) -> list[Path]:
+def write_pictures(
+    out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame], rendered_m: Sequence[Depth] = ()
+) -> list[Path]:
     """Write ``surface.png``, ``top_view.png`` and ``depth.png`` to a folder that exists; where the map has no
     measured surface, ``perspective.png`` shows its voxels instead.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
-    any a keyframe serves, and its title says so. Returns the paths. Raises MapFileError.
+    any a keyframe serves, and its title says so. ``rendered_m`` are the depths (H, W) that the map predicts
+    for them, if these are known. Returns the paths. Raises MapFileError.
     """
-    figures = {**_whole_map(m), "depth.png": depth_comparison(m, held_out)}
+    figures = {**_whole_map(m), "depth.png": depth_comparison(m, held_out, rendered_m)}
     for name, figure in figures.items():
         write_figure(figure, out_dir / name)
     return [out_dir / name for name in figures]
@@ -72,7 +78,9 @@ def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
     return {"perspective.png": perspective(room), "top_view.png": top_view(room)}
 
 
-def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
+def depth_comparison(
+    m: OccupancyMap, held_out: Sequence[Frame], rendered_m: Sequence[Depth] = ()
+) -> "Figure":
     """Depth as it was measured, but for the sensor's bias, rendered depth, and their difference, a row for
     each of a few frames; those without a flat image are unrolled.
 
@@ -86,15 +94,18 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
         return notice("There is no frame to compare the map with.")
     kind, rows = ("held-out frame", min(_DEPTH_ROWS, len(frames))) if held_out else ("keyframe", 1)
     # The middles of equal shares of the recording.
-    chosen = [frames[int((row + 0.5) * len(frames) / rows)] for row in range(rows)]
+    middles = [int((row + 0.5) * len(frames) / rows) for row in range(rows)]
+    chosen = [frames[at] for at in middles]
+    depths_m = [rendered_m[at] for at in middles] if rendered_m else [_rendered(m, each) for each in chosen]
     depth_colors = colormaps["turbo"].with_extremes(bad=_NO_DEPTH_GREY)
     difference_colors = colormaps["RdBu_r"].with_extremes(bad=_NO_DEPTH_GREY)
     limit = Normalize(-_DIFFERENCE_RANGE_CM, _DIFFERENCE_RANGE_CM)
     pictures = [unrolled(frame.camera) for frame in chosen]
     aspect = max(picture.camera.height / picture.camera.width for picture in pictures)
     figure = new_figure(15.0, rows * (4.3 * aspect + 0.35) + 0.1)
-    for axes, frame, picture in zip(figure.subplots(rows, 3, squeeze=False), chosen, pictures, strict=True):
-        rendered = np.asarray(m.render_depth(frame.camera, frame.T_world_camera), np.float64)
+    panels = figure.subplots(rows, 3, squeeze=False)
+    for axes, frame, depth_m, picture in zip(panels, chosen, depths_m, pictures, strict=True):
+        rendered = np.asarray(depth_m, np.float64)
         measured = surface_depth(frame, m.noise)
         measured[measured == 0] = np.nan
         error = depth_error(rendered, measured)
@@ -115,3 +126,7 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
         for ax in axes:
             ax.set(xticks=[], yticks=[])
     return figure
+
+
+def _rendered(m: OccupancyMap, frame: PosedDepth) -> Depth:
+    return m.render_depth(frame.camera, frame.T_world_camera)
