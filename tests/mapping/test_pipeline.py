@@ -73,8 +73,11 @@ def test_the_bias_of_the_sensor_is_no_error_of_the_map() -> None:
 
 def test_a_broken_held_out_frame_is_named_and_the_others_count() -> None:
     result = map_sequence(sequence(7), replace(ALL_FRAMES, evaluation=EvaluationConfig(hold_out=3)))
-    check = check_held_out(result.map, sequence(7, broken=[4]), result.held_out)
+    check = check_held_out(result.map, sequence(7, broken=[4]), result.held_out, keep=[1, 4])
     assert check.frames == 1
+    frame, rendered_m = check.kept.pop(1)
+    np.testing.assert_array_equal(rendered_m, result.map.render_depth(frame.camera, frame.T_world_camera))
+    assert not check.kept
     assert check.skipped == {"frame 4": "frame 4: the image is damaged"}
 
 

@@ -346,13 +346,14 @@ def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     The depth buffer's unsharp mask (Luft, Colditz and Deussen, SIGGRAPH 2006) at two scales.
     """
     met = np.isfinite(depth_m)
-    near, far = np.quantile(depth_m[met], [0.01, 0.99])
-    depth = np.where(met, depth_m, far).astype(np.float32)
+    near, far = np.quantile(depth_m[met], [0.01, 0.99]).astype(np.float32)
+    depth = np.where(met, depth_m, far)
     full = max(0.04 * float(far - near), 1e-6)
     out = np.zeros_like(depth)
     size = depth.shape[1], depth.shape[0]
     small = cv2.resize(depth, (-(-size[0] // 4), -(-size[1] // 4)), interpolation=cv2.INTER_AREA)
     for share_of_width in (0.004, 0.016):
         blurred = cv2.resize(cv2.GaussianBlur(small, (0, 0), share_of_width * small.shape[1]), size)
-        out += 0.5 * np.clip((depth - blurred) / full, 0.0, 1.0)
+        out += np.clip(np.subtract(depth, blurred, out=blurred), 0.0, full, out=blurred)
+    out *= 0.5 / full
     return out
