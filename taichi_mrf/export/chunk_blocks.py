@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, known_bricks
-from taichi_mrf.queries.points import OCCUPIED, classify
 from taichi_mrf.queries.voxel_map import VoxelMap
+from taichi_mrf.voxels.calls import calls_of
 from taichi_mrf.voxels.layers import (
     COLORS,
     FIRST,
@@ -48,8 +48,7 @@ def write_chunks(
         if colored is not None:
             found[COLORS] = colored.colors_in(reader.slots(bricks))
         if deciding is not None:
-            decided, own = (classify(x, *known) for x in (deciding.log_odds(bricks), log_odds))
-            found[FIRST] = ((decided == OCCUPIED) & (own != OCCUPIED)).astype(np.uint8)
+            found[FIRST] = calls_of(deciding.log_odds(bricks), log_odds, *known)
         return {name: BrickValues(bricks, values) for name, values in found.items()}
 
     bricks = known_bricks(m)

@@ -11,6 +11,9 @@ LARGEST = 1 << 30
 """No sum goes beyond this, on either side of 0: the sums of a voxel shrink together, so that their ratios
 stay. Only then does it matter in which order they were added."""
 
+VOTES = 2
+"""Numbers of a voxel among votes: its votes and its score (surface_votes.py)."""
+
 
 @dataclass(frozen=True)
 class BrickSums:

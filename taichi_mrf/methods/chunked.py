@@ -24,6 +24,7 @@ from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.calls import WON, follow_calls
 from taichi_mrf.voxels.layers import COLORS, FIRST, LOG_ODDS, SURFACE, Chunk
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, join_bricks, split_bricks
 
@@ -266,10 +267,11 @@ class ChunkedMap:
         likely = self._calibrated_chunk(chunk, shown) if self.has_surface else shown
         if self._by == "decided":
             least = called(prior, min_evidence)
-            first = ~unknown & (self.store.read(FIRST, chunk) > 0)
-            shown[first] = np.maximum(shown[first], least)
+            calls = np.where(unknown, np.uint8(0), self.store.read(FIRST, chunk).reshape(unknown.shape))
+            shown[calls == WON] = np.maximum(shown[calls == WON], least)
             if self.has_surface:
                 carry(likely.reshape(-1), shown.reshape(-1), prior, min_evidence, least)
+            follow_calls(calls, shown, prior, least)
         else:
             shown = likely
         return np.where(unknown & (shown == np.float32(prior)), np.float32(np.nan), shown)

@@ -111,11 +111,8 @@ class MapPart:
 
     @cached_property
     def _likely(self) -> "MapPart":
-        """The part with calibrated probabilities where the map holds what rays measured, else itself."""
-        if not self.source.holds_marginals or not self.has_surface:
-            return self
-        brick_m = BRICK * self.voxel_size
-        return take_part(self.source.calibrated(), self.lowest * brick_m, self.after * brick_m)
+        """The part by which voxels have their states where the map holds what rays measured, else itself."""
+        return self.decided if self.source.holds_marginals and self.has_surface else self
 
     @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:

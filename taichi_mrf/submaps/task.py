@@ -141,7 +141,7 @@ def _layers(m: PartialMap, job: Job, task: SubmapTask, core: Bricks) -> dict[str
         rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)
         found[SURFACE] = field.values.chosen(rows)
     if FIRST in job.layers:
-        found[FIRST] = BrickValues(core, m.first_surfaces()[slots].astype(np.uint8))
+        found[FIRST] = BrickValues(core, m.first_surfaces()[slots])
     return found
 
 

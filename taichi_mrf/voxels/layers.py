@@ -44,7 +44,7 @@ LAYERS = {
     LOG_ODDS: Layer("float32", 1, np.nan, "log-odds of being occupied"),
     COLORS: Layer("uint8", 4, 0, "red, green, blue, and how much was seen"),
     SURFACE: Layer("float32", 3, 0, "weight, and distance and excess times weight (DistanceField)"),
-    FIRST: Layer("uint8", 1, 0, "1 where the rays take a voxel for their first surface"),
+    FIRST: Layer("uint8", 1, 0, "what rays say beyond the marginal (calls.py)"),
 }
 """Every map has log-odds; the others are there if it has them."""
 

@@ -83,7 +83,7 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
     np.testing.assert_array_equal(marginals(m.layer(), voxels), before)
     sure = [v for v in voxels if v not in doubtful]
     counted = ti.ndarray(ti.f32, m.view.pool.belief.shape)
-    counted.from_numpy(m._parts.decisions._votes.to_numpy().astype(np.float32) / 4)
+    counted.from_numpy(m._parts.decisions._votes.to_numpy().reshape(-1, 2)[:, 0].astype(np.float32) / 4)
     found = [4 * reference.logit(p) for p in marginals(MapReading(m, m._parts, counted), sure).tolist()]
     np.testing.assert_allclose(found, [votes.get(v, 0) for v in sure], atol=1e-3)
     event(f"{sum(votes.get(v, 0) > 0 for v in expected)} voxels called")

@@ -90,7 +90,7 @@ def test_posts_of_a_fence_stay_and_gaps_stay_open() -> None:
     assert (gaps == OCCUPIED).mean() < 0.02
 
 
-def test_posts_stay_in_voxels_wider_than_they_are_if_rays_may_pass() -> None:
+def test_posts_stay_in_voxels_wider_than_they_are_more_so_if_rays_may_pass() -> None:
     shares = {}
     for pass_through in (0.0, 0.1):
         m = mapped(0.1, pass_through)
@@ -98,4 +98,4 @@ def test_posts_stay_in_voxels_wider_than_they_are_if_rays_may_pass() -> None:
         shares[pass_through] = (posts == OCCUPIED).mean()
         assert (gaps == FREE).mean() > 0.9
     assert shares[0.1] > 0.9
-    assert shares[0.1] > shares[0.0] + 0.3
+    assert 0.75 < shares[0.0] < shares[0.1]

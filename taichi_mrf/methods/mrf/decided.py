@@ -1,5 +1,5 @@
-"""Occupied voxels of an MRFMap: those whose marginal is over one half, and those that win the vote of the
-rays.
+"""Occupied voxels of an MRFMap: those whose marginal is over one half, those that win the vote of the rays,
+and those in which rays end that no voxel explains.
 
 A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not, and yet
 the rays agree on where it is (inference/surface_votes.py). After a full :meth:`infer` all votes are counted
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.inference.brick_sums import VOTES
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_registry import BrickRegistry
@@ -21,8 +22,9 @@ from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.later import later
+from taichi_mrf.voxels.calls import calls_of
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot, copied
+from taichi_mrf.voxels.pool import PoolSnapshot, copied
 
 if TYPE_CHECKING:
     from taichi_mrf.inference import surface_votes
@@ -46,7 +48,7 @@ class Decisions:
         """``keyframes`` are those of the map, now and later; ``kept`` has the votes that frozen ones have
         left, and ``sweeper`` what rays share."""
         self._registry, self._keyframes, self._kept, self._sweeper = registry, keyframes, kept, sweeper
-        self._votes = ti.ndarray(ti.i32, VOXELS)
+        self._votes = ti.ndarray(ti.i32, VOTES * VOXELS)
         self._identity = np.zeros(0, np.int64)
         self._counted: dict[int, Keyframe] = {}
         self._restarts = -1  # of the pool when votes were counted; -1 while they are not complete
@@ -71,11 +73,21 @@ class Decisions:
         runtime.settle()
         return log_odds
 
-    def winners(self, settled: bool) -> NDArray[np.bool_]:
-        """Which voxels win the vote, (slots, 512)."""
-        self._count(settled, lambda: None)
-        votes = self._votes.to_numpy()[: self._registry.pool.capacity * VOXELS]
-        return np.asarray(votes.reshape(-1, VOXELS) > 0)
+    def call_unexplained(self, log_odds: "ti.Ndarray") -> None:
+        """Change :meth:`log_odds` where rays end that no voxel explains (surface_votes.call_unexplained).
+        Scores have no dates: in a world that may change, they would bring back what has gone."""
+        pool = self._registry.pool
+        if pool.dated is None:
+            known = pool.prior_log_odds, self._sweeper.volume.min_evidence
+            surface_votes.call_unexplained(self._votes, log_odds, pool.bricks, pool.in_use, *known)
+
+    def calls(self, settled: bool) -> NDArray[np.uint8]:
+        """What rays say of voxels beyond the marginals, (slots, 512) (voxels/calls.py)."""
+        log_odds, pool = self.log_odds(settled), self._registry.pool
+        self.call_unexplained(log_odds)
+        known = pool.prior_log_odds, self._sweeper.volume.min_evidence
+        calls = calls_of(log_odds.to_numpy(), pool.belief.to_numpy(), *known)
+        return calls[: pool.capacity * VOXELS].reshape(-1, VOXELS)
 
     def frozen(self, id: int) -> None:
         """A keyframe was frozen: its votes stay until all are counted anew."""
@@ -102,7 +114,7 @@ class Decisions:
         """Forget all votes but those that frozen keyframes have left."""
         pool, kept = self._registry.pool, self._kept.share.votes
         self._counted, self._exact, self._restarts = {}, True, -1
-        self._votes = _zeros(pool)
+        self._votes = surface_votes.no_votes(pool.belief.shape[0])
         self._identity = pool.identity.copy()
         if len(kept.bricks):
             slots = self._registry.topology.slots(kept.bricks)
@@ -119,7 +131,8 @@ class Decisions:
         votes = surface_votes.count_votes(
             zip(keyframes, seen, strict=True), part, model, self._sweeper.volume, between
         )
-        surface_votes.add_votes(slots, votes.to_numpy()[: len(slots) * VOXELS], self._votes)
+        more = votes.to_numpy()[: len(slots) * VOXELS * VOTES]
+        surface_votes.add_votes(slots, more, self._votes)
 
     def _follow_bricks(self) -> None:
         """Forget the votes of bricks that are gone, and make room for new ones."""
@@ -129,13 +142,6 @@ class Decisions:
             return
         self._identity = pool.identity.copy()
         kept = np.flatnonzero(before == self._identity[: len(before)]).astype(np.int32)
-        votes = old.to_numpy().reshape(-1, VOXELS)[kept]
-        self._votes = _zeros(pool)
+        votes = old.to_numpy().reshape(-1, VOXELS * VOTES)[kept]
+        self._votes = surface_votes.no_votes(pool.belief.shape[0])
         surface_votes.add_votes(kept, votes.reshape(-1), self._votes)
-
-
-def _zeros(pool: BrickPool) -> "ti.Ndarray":
-    """No votes, (capacity * 512)."""
-    votes = ti.ndarray(ti.i32, pool.belief.shape)
-    votes.fill(0)
-    return votes

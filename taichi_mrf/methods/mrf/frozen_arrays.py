@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
+from taichi_mrf.inference.brick_sums import LARGEST, VOTES, BrickSums
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated_channels import NEVER
 from taichi_mrf.methods.map_file import read_places
@@ -71,14 +71,19 @@ def ray_arrays(share: RayShare) -> dict[str, NDArray]:
 
 def read_rays(path: Path, file: NpzFile) -> RayShare:
     """Rays of frozen keyframes in a file. Raises MapFileError for sums that no keyframes have left."""
-    return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", 1))
+    return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", VOTES))
 
 
 def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
     if f"frozen_{name}_bricks" not in file:
         return BrickSums.nothing(values)
     bricks = read_places(path, file, f"frozen_{name}_bricks")
-    sums = file.integers(f"frozen_{name}_sums", (len(bricks), VOXELS, values), -LARGEST, LARGEST)
+    of_before = name == "vote" and file.header(f"frozen_{name}_sums")[0][-1:] == (1,)  # 1.0.0 kept no scores
+    sums = file.integers(
+        f"frozen_{name}_sums", (len(bricks), VOXELS, 1 if of_before else values), -LARGEST, LARGEST
+    )
+    if of_before:
+        sums = np.concatenate([sums, np.zeros_like(sums)], axis=2)
     if (values == VALUES and (sums[..., 0] < 0).any()) or (np.diff(grid_keys(bricks)) <= 0).any():
         raise MapFileError(f"{path}: damaged: frozen_{name}_bricks or _sums are not in order")
     return BrickSums(bricks, sums.astype(np.int32))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.inference.brick_sums import BrickSums
+from taichi_mrf.inference.brick_sums import VOTES, BrickSums
 from taichi_mrf.voxels.distance_field import VALUES, DistanceField
 from taichi_mrf.voxels.layers import FIRST, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
@@ -22,7 +22,7 @@ STEPS = 1024.0
 
 @dataclass(frozen=True)
 class RayShare:
-    """``distances``: the sums of DistanceField in 1 / STEPS; ``votes``: one a voxel."""
+    """``distances``: the sums of DistanceField in 1 / STEPS; ``votes``: VOTES of a voxel."""
 
     distances: BrickSums
     votes: BrickSums
@@ -30,7 +30,7 @@ class RayShare:
     @staticmethod
     def nothing() -> "RayShare":
         """That of no keyframe."""
-        return RayShare(BrickSums.nothing(VALUES), BrickSums.nothing(1))
+        return RayShare(BrickSums.nothing(VALUES), BrickSums.nothing(VOTES))
 
     @property
     def nbytes(self) -> int:

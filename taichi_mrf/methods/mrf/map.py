@@ -458,12 +458,12 @@ class MRFMap(BrickMap):
         return reading.calibrated(self, self._parts, between)
 
     def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
-        """Calibrated where distances are at hand, else the marginals."""
-        return self.calibrated()._grid() if self.has_surface else self._grid()
+        """Those by which voxels have their states where distances are at hand, else the marginals."""
+        return self.decided._grid() if self.has_surface else self._grid()
 
-    def first_surfaces(self) -> NDArray[np.bool_]:
-        """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
-        return self._parts.decisions.winners(self.settled)
+    def first_surfaces(self) -> NDArray[np.uint8]:
+        """What rays say of the voxels of ``view.pool`` beyond marginals, (slots, 512) (voxels/calls.py)."""
+        return self._parts.decisions.calls(self.settled)
 
     def changes(self, since_s: float) -> "change.MapChange":
         """Difference between the map as of a time in seconds and now: ``appeared`` are voxels that were free

@@ -118,7 +118,7 @@ class MovingWindow:
         if parts.kept.wanted:
             self._fetch_crossed(measured_bricks(parts))
             surface = surface_field(parts) if parts.settled else parts.kept.share.field
-            first = parts.decisions.winners(settled=True) if parts.settled else None
+            first = parts.decisions.calls(settled=True) if parts.settled else None
         resident = self._resident(header, surface, first)
         self.parked.complete(folder_beside(path), resident, header)
         return self.parked.names
@@ -220,10 +220,10 @@ class MovingWindow:
         return contents
 
     def _resident(
-        self, header: StoreHeader, surface: DistanceField | None, first: NDArray[np.bool_] | None
+        self, header: StoreHeader, surface: DistanceField | None, first: NDArray[np.uint8] | None
     ) -> Iterator[tuple[NDArray[np.int32], dict[str, BrickValues]]]:
         """All chunks in memory with their layers, some at a time: colours if these are known, the distances
-        of ``surface``, and the voxels (slots, 512) that rays take for their ``first`` surface."""
+        of ``surface``, and what rays say of voxels (slots, 512) beyond marginals, ``first``."""
         measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
         footprints = [k.footprint for k in self._parts.keyframes.values()]
         crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
@@ -236,7 +236,7 @@ class MovingWindow:
             if len(colors):
                 layers[COLORS] = BrickValues(bricks, colors)
             if first is not None:
-                layers[FIRST] = BrickValues(bricks, first[slots].astype(np.uint8))
+                layers[FIRST] = BrickValues(bricks, first[slots])
             if surface is not None:
                 layers[SURFACE] = surface.values.in_chunks(some)
             yield some, {LOG_ODDS: self._voxels(some, header), **layers}

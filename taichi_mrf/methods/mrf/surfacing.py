@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
-from taichi_mrf.inference.brick_sums import BrickSums
+from taichi_mrf.inference.brick_sums import VOTES, BrickSums
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
@@ -104,9 +104,9 @@ def keep_rays(parts: MapParts, keyframe: Keyframe) -> None:
     seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]
     field = SurfaceRays(part, _model_of(parts), volume).field(seen)
     sums = np.rint(field.sums * STEPS).astype(np.int32)
-    votes = count_votes(seen, part, parts.sweeper.model(), volume).to_numpy()[: len(visible.slots) * VOXELS]
+    votes = count_votes(seen, part, parts.sweeper.model(), volume).to_numpy().reshape(-1, VOXELS, VOTES)
     bricks = parts.pool.bricks[visible.slots]
-    share = RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes.reshape(-1, VOXELS, 1)))
+    share = RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes[: len(bricks)]))
     if parts.registry.before_claim is not None:  # what is outside of the window comes back
         parts.registry.before_claim(share.distances.bricks)
     parts.kept.restore(share)

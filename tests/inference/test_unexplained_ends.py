@@ -1,0 +1,119 @@
+"""Things that are thinner than a voxel: rays that end on them are few, and no voxel explains them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise, load_map
+from taichi_mrf.queries.points import FREE, OCCUPIED
+
+CAMERA = PinholeCamera(96, 72, 80.0, 80.0, 47.5, 35.5)
+VOXEL, WALL_M, POST_M, RADIUS_M = 0.05, 2.02, 1.02, 0.012
+POST_X_M = 0.02
+STEPS_M = np.linspace(-0.4, 0.4, 10)
+NOISE = PolynomialNoise(sigma=(0.004,))
+
+
+def depth_image(x_m: float, with_post: bool = True, post_m: float = POST_M) -> NDArray[np.float32]:
+    """What a camera at (x, 0, 0) that looks along z sees: a wall, and an upright post in front of it."""
+    u, _ = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    slope = (u - CAMERA.cx) / CAMERA.fx
+    at_post_m = x_m + slope * post_m
+    on_post = with_post & (np.abs(at_post_m - POST_X_M) < RADIUS_M)
+    return np.where(on_post, post_m, WALL_M).astype(np.float32)
+
+
+def pose(x_m: float) -> NDArray[np.float64]:
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = x_m
+    return T_world_camera
+
+
+def mapped(posts: NDArray[np.bool_], **parameters: object) -> MRFMap:
+    """A map of keyframes, in some of which the post is there."""
+    m = MRFMap(VOXEL, NOISE, **parameters)
+    for i, (x_m, there) in enumerate(zip(STEPS_M, posts, strict=True)):
+        m.add_keyframe(depth_image(x_m, bool(there)), pose(x_m), CAMERA, f"{i}", float(i))
+    return m
+
+
+def post_points() -> NDArray[np.float64]:
+    heights_m = np.arange(-0.2, 0.2, VOXEL) + 0.02
+    return np.stack([np.full_like(heights_m, POST_X_M), heights_m, np.full_like(heights_m, POST_M)], axis=1)
+
+
+ALWAYS = np.ones(len(STEPS_M), bool)
+
+
+@pytest.mark.compilers
+@pytest.mark.usefixtures("backend")
+def test_a_post_thinner_than_a_voxel_is_occupied_and_in_the_way() -> None:
+    m = mapped(ALWAYS)
+    m.infer()
+    assert (m.occupancy(post_points()) < 0.05).all()  # the rays that pass beside it outvote those that end
+    assert (m.state(post_points()) == OCCUPIED).all()
+    beside = np.add(post_points(), (0.1, 0.0, 0.0))
+    assert (m.state(beside) == FREE).all()
+    way = np.array([[POST_X_M, 0.0, 0.7], [POST_X_M, 0.0, 1.3]])
+    assert m.path_collision(way, 0.1) > 0.95
+    assert m.path_collision(np.add(way, (0.25, 0.0, 0.0)), 0.1) < 0.05
+    hits = m.decided.render_depth(CAMERA, pose(0.0))
+    assert abs(float(hits[36, 49]) - POST_M) < 1.5 * VOXEL
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("first", [0, 4, 8])
+def test_what_was_there_in_two_of_ten_keyframes_is_not_occupied(first: int) -> None:
+    there = ~ALWAYS
+    there[first : first + 2] = True
+    m = mapped(there)
+    m.infer()
+    assert not (m.state(post_points()) == OCCUPIED).any()
+
+
+@pytest.mark.usefixtures("backend")
+def test_scores_are_those_of_keyframes_with_ends_and_without() -> None:
+    there = ALWAYS.copy()
+    there[[2, 5, 6]] = False
+    m = mapped(there)
+    m.infer()
+    m.state([[0.0, 0.0, 0.0]])
+    scores = m._parts.decisions._votes.to_numpy().reshape(-1, 512, 2)[..., 1]
+    topology = m._parts.registry.topology
+    cell = np.floor(post_points() / VOXEL).astype(np.int64)
+    slots = topology.slots((cell // 8).astype(np.int32))
+    inside = cell % 8
+    number = (inside[:, 0] * 8 + inside[:, 1]) * 8 + inside[:, 2]
+    # Three keyframes see more than ten rays pass: each takes a nat away.
+    assert (scores[slots, number] == 7 * 39 - 3 * 10).all()
+
+
+@pytest.mark.usefixtures("backend")
+def test_order_freezing_and_a_file_keep_the_post(tmp_path: Path) -> None:
+    m = mapped(ALWAYS, keep_surface=True)
+    m.infer()
+    whole = m.state(post_points())
+    backwards = MRFMap(VOXEL, NOISE, keep_surface=True)
+    for i in reversed(range(len(STEPS_M))):
+        backwards.add_keyframe(depth_image(STEPS_M[i]), pose(STEPS_M[i]), CAMERA, f"{i}", float(i))
+    backwards.infer()
+    np.testing.assert_array_equal(backwards.state(post_points()), whole)
+    for id in list(m.keyframes)[:5]:
+        m.freeze_keyframe(id)
+    m.infer()
+    assert (m.state(post_points()) == OCCUPIED).all()
+    m.save(tmp_path / "map.npz")
+    np.testing.assert_array_equal(load_map(tmp_path / "map.npz").state(post_points()), m.state(post_points()))
+
+
+@pytest.mark.usefixtures("backend")
+def test_just_before_a_larger_surface_a_post_makes_a_voxel_unknown() -> None:
+    m, post_m = MRFMap(VOXEL, NOISE), 1.93
+    for i, x_m in enumerate(STEPS_M):
+        m.add_keyframe(depth_image(x_m, post_m=post_m), pose(x_m), CAMERA, f"{i}", float(i))
+    m.infer()
+    points = np.add(post_points(), (0.0, 0.0, post_m - POST_M))
+    assert (m.occupancy(points) < 0.05).all()
+    assert not np.isin(m.state(points), (FREE, OCCUPIED)).any()
