@@ -38,6 +38,8 @@ class Thing:
 
     kind: str
     shape: Shape
+    part_of: str = ""
+    """What it is a part of, such as a fence whose wires, rails and posts stand closer than a ball is wide."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,16 @@ class Scene:
         """The depth at which rays (N, 3) from a point meet something, inf for nothing, and which of the
         things that is, -1 for none; (N,) each."""
         depth_m, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
+        lengths = np.linalg.norm(rays, axis=1)
         for i, thing in enumerate(self.things):
-            there = thing.shape.depth(origin_m, rays)
-            nearer = there < depth_m
-            depth_m[nearer], which[nearer] = there[nearer], i
+            to = thing.shape.centre_m - origin_m
+            tangent = to @ to - thing.shape.half_m @ thing.shape.half_m  # squared, to a ball around it
+            near = np.arange(len(rays))
+            if tangent > 0:
+                near = np.flatnonzero(rays @ to >= math.sqrt(tangent) * lengths)
+            there = thing.shape.depth(origin_m, rays[near])
+            nearer = there < depth_m[near]
+            depth_m[near[nearer]], which[near[nearer]] = there[nearer], i
         return depth_m, which
 
     def clearance(self, points_m: Array, things: Sequence[Thing] | None = None) -> Array:
@@ -112,7 +120,7 @@ def depth_camera(sigma: tuple[float, ...], max_depth: float) -> Sensor:
 
 
 def spinning_lidar(yard: bool) -> Sensor:
-    """16 rings of 1024 columns, from 30 degrees down to 30 up in a room; 32 in a yard, from 8 down to 4 up."""
+    """1024 columns and 16 rings, 30 degrees up and down, in a room; 32, 8 down to 4 up, in a yard."""
     rings = np.linspace(4, -8, 32) if yard else np.linspace(30, -30, 16)
     azimuths = np.linspace(math.pi, -math.pi, 1025)[:-1]
     return Sensor(SphericalCamera(np.radians(rings), azimuths), (0.02,), 60.0 if yard else 15.0)
@@ -180,14 +188,24 @@ class Builder:
         frame = self._turn @ _turn(yaw)
         self.things.append(Thing(kind, Box(self._at(centre_m), 0.5 * np.array(size_m), frame)))
 
-    def rod(self, kind: str, start_m: Sequence[float], end_m: Sequence[float], diameter_m: float) -> None:
+    def rod(
+        self,
+        kind: str,
+        start_m: Sequence[float],
+        end_m: Sequence[float],
+        diameter_m: float,
+        part_of: str = "",
+    ) -> None:
         """A rod with round ends."""
-        self.things.append(Thing(kind, Capsule(self._at(start_m), self._at(end_m), 0.5 * diameter_m)))
+        rod = Capsule(self._at(start_m), self._at(end_m), 0.5 * diameter_m)
+        self.things.append(Thing(kind, rod, part_of))
 
-    def disc(self, kind: str, centre_m: Sequence[float], normal: Array, radius_m: float) -> None:
+    def disc(
+        self, kind: str, centre_m: Sequence[float], normal: Array, radius_m: float, part_of: str = ""
+    ) -> None:
         """A flat disc."""
         upright = self._turn @ (normal / np.linalg.norm(normal))
-        self.things.append(Thing(kind, Disc(self._at(centre_m), upright, radius_m)))
+        self.things.append(Thing(kind, Disc(self._at(centre_m), upright, radius_m), part_of))
 
     def walls(self, length_m: float, width_m: float, height_m: float, ceiling: bool = True) -> None:
         """Floor, four walls and a ceiling, solid, around the given inner space."""
@@ -227,23 +245,23 @@ class Builder:
 
     def plant(self, x_m: float, y_m: float, leaves: int, draw: np.random.Generator) -> None:
         """A stem, and leaves of 6 to 12 cm in all orientations around it."""
-        self.rod("stem", (x_m, y_m, 0.01), (x_m, y_m, 1.1), 0.02)
+        self.rod("stem", (x_m, y_m, 0.01), (x_m, y_m, 1.1), 0.02, "plant")
         for _ in range(leaves):
             off = draw.normal(size=3)
             off *= draw.uniform(0.12, 0.4) / np.linalg.norm(off)
             centre = (x_m + off[0], y_m + off[1], 0.9 + off[2])
-            self.disc("leaf", centre, draw.normal(size=3), draw.uniform(0.03, 0.06))
+            self.disc("leaf", centre, draw.normal(size=3), draw.uniform(0.03, 0.06), "plant")
 
     def fence(self, start_m: Array, end_m: Array, height_m: float, wire_m: float) -> None:
         """Upright wires every 5 cm between two rails of 3 cm and two posts of 4 cm."""
         length = float(np.linalg.norm(end_m - start_m))
         for height in (0.1, height_m):
-            self.rod("rail", (*start_m, height), (*end_m, height), 0.03)
+            self.rod("rail", (*start_m, height), (*end_m, height), 0.03, "fence")
         for end in (start_m, end_m):
-            self.rod("post 4 cm", (*end, 0.02), (*end, height_m), 0.04)
+            self.rod("post 4 cm", (*end, 0.02), (*end, height_m), 0.04, "fence")
         for share in np.arange(0.05, length - 0.04, 0.05) / length:
             foot = start_m + share * (end_m - start_m)
-            self.rod("wire", (*foot, 0.1), (*foot, height_m), wire_m)
+            self.rod("wire", (*foot, 0.1), (*foot, height_m), wire_m, "fence")
 
     def _at(self, point_m: Sequence[float]) -> Array:
         return self._turn @ np.asarray(point_m, float) + SHIFT_M

@@ -91,7 +91,7 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """A rod with round ends: all within ``radius_m`` of the segment from ``start_m`` to ``end_m``, (3,) each."""
+    """A rod with round ends: all within a radius of the segment from ``start_m`` to ``end_m``, (3,) each."""
 
     start_m: Array
     end_m: Array
