@@ -5,7 +5,7 @@
 Views are made by closed forms (thin_shapes.py, thin_rooms.py), with the noise that the map is told. Of each
 kind of thing, those voxels count that it has a point in and in which ten or more measurements of it end.
 The table also gives the pixels of held-out views whose first surface is of that kind, and the collision of a
-ball on a path straight through a thing, and past it. Three lines below it are about the whole map.
+ball on a path straight through a thing, and past it. The lines below it are about the whole map.
 """
 
 import json
@@ -126,12 +126,20 @@ class Result:
     seconds: float
     occupied: int
     precision: float
+    """Share of the occupied voxels that anything has a point in; walls are 10 cm thick."""
+
     recall: float
     furthest: int
     """Voxels from the furthest occupied voxel to matter, the largest of the three axes' differences."""
 
     beyond_one: float
     """Share of the occupied voxels that are further than one from matter."""
+
+    precision_inside: float
+    """The precision without the voxels that lie wholly behind the faces of walls, where nothing is seen."""
+
+    furthest_inside: int
+    beyond_one_inside: float
 
     blocked: float
     """Share of the held-out rays that enter an occupied voxel in front of what they measured."""
@@ -211,6 +219,7 @@ def measure(
     if not real.all():
         tree = cKDTree(_unpacked(truth.matter))
         apart[~real] = np.rint(tree.query(occupied[~real], p=np.inf)[0]).astype(int)
+    inside = scene.inner.touched_by((occupied + 0.5) * m.voxel_size, 0.5 * m.voxel_size)
     pixels = _held_out_pixels(m, scene, sensor, held_out)
     return {
         "occupied": len(keys),
@@ -218,6 +227,9 @@ def measure(
         "recall": _mean(np.isin(truth.all_measured, keys)),
         "furthest": int(apart.max(initial=0)),
         "beyond_one": _mean(apart > 1),
+        "precision_inside": _mean(real[inside]),
+        "furthest_inside": int(apart[inside].max(initial=0)),
+        "beyond_one_inside": _mean(apart[inside] > 1),
         "blocked": _blocked(m, sensor, held_out),
         "kinds": {
             kind: _kind(m, voxels, pixels[kind], [path for path in paths if path.kind == kind])
@@ -302,8 +314,15 @@ def print_result(result: Result) -> None:
             f"{k.right:5.2f} {k.through:5.2f} {k.unanswered:5.2f} | {k.paths_through:7d} {k.hit:5.2f} "
             f"{k.hit_mean:5.2f} | {k.paths_past:4d} {k.cleared:5.2f} {k.past_mean:5.2f}"
         )
-    print(f"{result.occupied} occupied: precision {result.precision:.3f}, recall {result.recall:.3f}")
-    print(f"furthest from matter {result.furthest} voxels, {result.beyond_one:.4f} further than one")
+    print(f"{result.occupied} occupied, recall {result.recall:.3f}")
+    print(
+        f"precision {result.precision:.3f}, furthest from matter {result.furthest} voxels, "
+        f"{result.beyond_one:.4f} further than one"
+    )
+    print(
+        f"inside the walls {result.precision_inside:.3f}, {result.furthest_inside} voxels, "
+        f"{result.beyond_one_inside:.4f}"
+    )
     print(f"held-out rays blocked {result.blocked:.3f}; mapped in {result.seconds:.1f} s", flush=True)
 
 

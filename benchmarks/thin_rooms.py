@@ -48,6 +48,9 @@ class Scene:
 
     name: str
     things: tuple[Thing, ...]
+    inner: Box
+    """The space between the faces of the walls."""
+
     half_walk_m: tuple[float, float]
     """Half the sides of the rectangle in which the sensor goes round, before the turn."""
 
@@ -181,6 +184,7 @@ class Builder:
 
     def __init__(self) -> None:
         self.things: list[Thing] = []
+        self.inner = Box(np.zeros(3), np.zeros(3), np.eye(3))
         self._turn = _turn()
 
     def box(self, kind: str, centre_m: Sequence[float], size_m: Sequence[float], yaw: float = 0.0) -> None:
@@ -210,6 +214,8 @@ class Builder:
     def walls(self, length_m: float, width_m: float, height_m: float, ceiling: bool = True) -> None:
         """Floor, four walls and a ceiling, solid, around the given inner space."""
         w, beyond = WALL_M, 2 * WALL_M
+        half = 0.5 * np.array([length_m, width_m, height_m])
+        self.inner = Box(self._at((0, 0, half[2])), half, self._turn)
         for z in (-0.5 * w, height_m + 0.5 * w)[: 1 + ceiling]:
             self.box(WALL, (0, 0, z), (length_m + beyond, width_m + beyond, w))
         for side in (-0.5, 0.5):
@@ -282,7 +288,7 @@ def room(seed: int) -> Scene:
             build.rod(kind, (x, y, 0.03), (x, y, 2.45), diameter)
     build.rod("cable", (-2.4, 0.1, 1.5), (2.4, 0.25, 1.7), 0.01)
     build.rod("cable", (-1.0, -1.9, 0.9), (-0.8, 1.9, 1.3), 0.01)
-    return Scene("room", tuple(build.things), (2.0, 1.5))
+    return Scene("room", tuple(build.things), build.inner, (2.0, 1.5))
 
 
 def fence(seed: int) -> Scene:
@@ -290,7 +296,7 @@ def fence(seed: int) -> Scene:
     build = Builder()
     build.walls(5, 4, 2.5)
     build.fence(np.array([-1.4, 0.1]), np.array([1.3, -0.2]), 1.4, 0.003)
-    return Scene("fence", tuple(build.things), (2.0, 1.5))
+    return Scene("fence", tuple(build.things), build.inner, (2.0, 1.5))
 
 
 def clutter(seed: int) -> Scene:
@@ -303,7 +309,7 @@ def clutter(seed: int) -> Scene:
     build.chair(0.4, 0.7, -2.0, slats=True)
     build.plant(1.7, 1.1, 60, draw)
     build.plant(-1.8, -1.2, 60, draw)
-    return Scene("clutter", tuple(build.things), (2.0, 1.5))
+    return Scene("clutter", tuple(build.things), build.inner, (2.0, 1.5))
 
 
 def yard(seed: int) -> Scene:
@@ -317,7 +323,7 @@ def yard(seed: int) -> Scene:
     build.fence(np.array([-4.0, 6.0]), np.array([4.0, 6.5]), 1.6, 0.003)
     for height in (1.2, 2.0):
         build.rod("cable", (-15, -8, height), (15, -7, height + 0.5), 0.02)
-    return Scene("yard", tuple(build.things), (6.0, 3.0))
+    return Scene("yard", tuple(build.things), build.inner, (6.0, 3.0))
 
 
 SCENES: dict[str, Callable[[int], Scene]] = {"room": room, "fence": fence, "clutter": clutter, "yard": yard}
