@@ -53,3 +53,16 @@ def test_the_first_run_compiles_no_longer_than_before(repository: Path) -> None:
         repository / "benchmarks" / "first_run.py",
         "--gate", str(repository / "benchmarks" / "first_run.json"),
     )  # fmt: skip
+
+
+def test_the_measurement_of_thin_things_runs(repository: Path, tmp_path: Path) -> None:
+    out = tmp_path / "thin.json"
+    command = [sys.executable, "-m", "benchmarks.thin", "--voxel-size", "0.1", "--method", "mrf", "log_odds"]
+    command += ["--views", "6", "--held-out", "1", "--json", str(out), "--arch", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository)
+    assert done.returncode == 0, done.stdout + done.stderr
+    mrf, log_odds = json.loads(out.read_text(encoding="utf-8"))
+    assert (mrf["method"], log_odds["method"]) == ("mrf", "log_odds")
+    assert mrf["precision"] > log_odds["precision"]
+    assert {"leg", "post 2 cm", "post 4 cm", "post 6 cm", "cable", "wall"} <= set(mrf["kinds"])
+    assert log_odds["kinds"]["post 6 cm"]["occupied"] > 0.8
