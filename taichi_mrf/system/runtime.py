@@ -30,9 +30,9 @@ ABILITIES = {
 """The kind of map that each backend supports: Vulkan has no sparse fields."""
 
 FEWER_PASSES = {"cpu": "advanced_optimization", "software": "cfg_optimization"}
-"""The compiler's optimisation that is switched off: nine tenths of the time of compiling, for kernels
-that are no faster (docs/compilers.md). Vulkan cannot do without the advanced one. A GPU keeps both: none
-was at hand to measure."""
+"""The compiler's optimisation that is switched off: it takes nine tenths of the time of compiling, and a
+keyframe is a few hundredths slower without it (docs/compilers.md). Vulkan cannot do without the advanced one.
+A GPU keeps both: none was at hand to measure."""
 
 SOFTWARE_BLOCK = 8
 """Threads in a block of a software device: in larger ones Mesa's Vulkan skips iterations of long loops."""

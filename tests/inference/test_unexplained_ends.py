@@ -1,5 +1,6 @@
 """Things that are thinner than a voxel: rays that end on them are few, and no voxel explains them."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise, load_map
 from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.system.npz_file import MANIFEST, manifest_lines
 
 CAMERA = PinholeCamera(96, 72, 80.0, 80.0, 47.5, 35.5)
 VOXEL, WALL_M, POST_M, RADIUS_M = 0.05, 2.02, 1.02, 0.012
@@ -117,3 +119,25 @@ def test_just_before_a_larger_surface_a_post_makes_a_voxel_unknown() -> None:
     points = np.add(post_points(), (0.0, 0.0, post_m - POST_M))
     assert (m.occupancy(points) < 0.05).all()
     assert not np.isin(m.state(points), (FREE, OCCUPIED)).any()
+
+
+@pytest.mark.usefixtures("backend")
+def test_a_file_whose_frozen_keyframes_left_no_scores_is_read(tmp_path: Path) -> None:
+    """As version 1.0.0 wrote it."""
+    m = mapped(ALWAYS, keep_surface=True)
+    m.infer()
+    for id in list(m.keyframes):
+        m.freeze_keyframe(id)
+    m.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as file:
+        arrays = {name: file[name] for name in file.files if name != MANIFEST}
+    arrays["frozen_vote_sums"] = arrays["frozen_vote_sums"][..., :1]
+    np.savez(tmp_path / "old.npz", **arrays)
+    with zipfile.ZipFile(tmp_path / "old.npz") as archive:
+        arrays[MANIFEST] = np.array(manifest_lines(iter(archive.infolist())))
+    np.savez(tmp_path / "old.npz", **arrays)
+    new, old = load_map(tmp_path / "map.npz"), load_map(tmp_path / "old.npz")
+    wall = np.stack([np.linspace(-0.3, 0.3, 7), np.zeros(7), np.full(7, WALL_M)], axis=1)
+    np.testing.assert_array_equal(old.state(wall), new.state(wall))
+    assert (new.state(post_points()) == OCCUPIED).all()
+    assert not (old.state(post_points()) == OCCUPIED).any()
