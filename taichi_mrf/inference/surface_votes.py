@@ -10,23 +10,23 @@ voxel that it crosses before it. A voxel wins that more than two fifths of the r
 take for their surface. Rays whose measurement the map holds for an outlier do not vote.
 
 A post that is thinner than a voxel stops a few of the rays that cross the voxel, and the others outvote them:
-the marginal says free, and the measurements on the post are outliers to the map. They are counted, too. A ray
-that no voxel explains ends in the voxel of its measurement. With the keyframes k in which such rays end in a
-voxel, and p_j rays of each other keyframe j that pass it,
+the marginal says free. Ends are therefore counted, too, whatever the marginals explain them by. A measurement
+whose sigma is small ends in one voxel. With e_k the most that an end says of a voxel that other rays of the
+keyframe k pass, and p_j the rays of each keyframe j without an end in it that pass,
 
-    score = sum_k ENDED - sum_j min(p_j, PASSED)
+    score = sum_k e_k - sum_j min(p_j, PASSED)
 
-is the evidence that something in it stops rays, in tenths of a nat. A thing that is always there has ends in
-most keyframes; one that moves, a flying pixel or a pose that is off has them in few, and the others outweigh
-these. A voxel with more than DOUBT is not called free. With more than MATTER it is occupied, if it has no
-more than ALONE occupied voxels around it: beside a larger surface, ends are its noise or its edge.
+is the evidence, in twentieths of a nat, that something in the voxel stops one ray in twenty. A keyframe whose
+rays all end in a voxel says nothing: that voxel is full, and the marginals' business. A thing that is always
+there has ends in most keyframes; one that moves, a flying pixel or a pose that is off has them in few, and
+the others outweigh these. What follows from a score is in thin_matter.py.
+
+In a world that may change, each keyframe that sees a voxel takes an eighth from its score first, so that what
+has gone is forgotten.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference.brick_sums import VOTES
@@ -38,9 +38,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Struct, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.blended_field import cell_of, voxel_around
-from taichi_mrf.voxels.calls import DOUBT, MATTER, SUREST
-from taichi_mrf.voxels.layout import VOXELS, grid_keys, rows_around
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import flat, strip_begin, strip_length, voxel_number
 from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.traversal import walk_voxels, within
@@ -53,23 +51,28 @@ come as far take it for their surface. With half, walls have holes where voxels 
 GRAZED = 0.1
 """A ray that is in a voxel for less than this, in voxel sizes, does not vote against it."""
 
-UNEXPLAINED = 1e-3
-"""A ray ends in the voxel of its measurement if no voxel likelier than the prior made that with more than
-this density, in 1/m."""
+SHARP, BLURRED = 0.25, 1.0
+"""Sigmas, in voxel sizes: up to the first an end says ENDED, up to the second BLURRED_END, then nothing."""
 
-SHARPEST_VOXELS = 1.0
-"""Only rays with a sigma up to this, in voxel sizes, tell the voxel in which they end."""
+ENDED, BLURRED_END = 78, 40
+"""Twentieths of a nat that an end says of its voxel, log(1 / .02) and log(1 / .135): in so many keyframes
+there is one where nothing is."""
 
-ENDED, PASSED = 39, 10
-"""Tenths of a nat for a keyframe with ends in a voxel, log(1 / .02): one in fifty has them where nothing is;
-and the most against, for one without."""
+PASSED = 30
+"""The most that the passing rays of one keyframe say against, for poses that are off."""
 
-ALONE, NEIGHBOURS = 3, 2
-"""Occupied voxels at most around one that is occupied by its score, and how many voxels away they count."""
+BEFORE_SIGMAS = 3.0
+"""A ray without a surface to vote for passes what lies so many sigmas before its measurement."""
 
-_PASS, _END = 21, 42
-"""Lowest bits of the numbers of rays that vote against a voxel and that end in it, among the counts of one
-keyframe. Those that vote for it are below. Each number has 21 bits."""
+FADING = 3
+"""A keyframe takes 1 / 2^FADING from the scores of what it sees, in a world that may change."""
+
+LASTING = ENDED << FADING
+"""The largest score that fading leaves."""
+
+_PASS, _SILENT = 21, 42
+"""Lowest bits of the numbers of rays that vote against a voxel, and that pass it without a vote, among the
+counts of one keyframe. Those that vote for it are below. Each number has 21 bits."""
 
 CALLED = 0.01
 """Log-odds above even odds, or above what counts as known, that a voxel that wins has at least."""
@@ -80,15 +83,19 @@ def count_votes(
     pool: BrickPool | PoolPart,
     model: RayModel,
     volume: VolumeConfig,
+    votes: "ti.Ndarray",
+    changing: bool = False,
     between: Callable[[], object] = lambda: None,
-) -> "ti.Ndarray":
-    """The votes and the score of each voxel, (capacity * 512 * VOTES) int32, of keyframes with their lists of
-    visible bricks; ``model`` are the parameters of their rays. ``between`` is called after each keyframe."""
+) -> None:
+    """Add the rays of keyframes, with their lists of visible bricks, to the votes and scores
+    (capacity * 512 * VOTES) int32; ``model`` are the parameters of their rays. In a ``changing`` world their
+    order counts, and old scores fade. ``between`` is called after each keyframe."""
     learnt = pool.prior_log_odds + volume.min_evidence
     index = WindowIndex()
-    votes, counts = no_votes(pool.belief.shape[0]), ti.ndarray(ti.i64, pool.belief.shape)
+    counts, ends = ti.ndarray(ti.i64, pool.belief.shape), ti.ndarray(ti.i32, pool.belief.shape)
     counts.fill(0)
-    free_logs, vote = FreeLogs.of(pool, model), _Vote(pool.belief, learnt, counts)
+    ends.fill(0)
+    free_logs, vote = FreeLogs.of(pool, model), _Vote(pool.belief, learnt, counts, ends)
     for keyframe, visible in keyframes:
         if len(visible.slots) > 0:
             window = keyframe.footprint.window
@@ -99,10 +106,9 @@ def count_votes(
                 model, free_logs, workers_without_trace(), vote,
             )  # fmt: skip
             index.clear(window, visible.cells)
-            _tally(visible.slots, counts, votes, strip_length())
+            _tally(visible.slots, counts, ends, votes, int(changing), strip_length())
             runtime.settle()
         between()
-    return votes
 
 
 def no_votes(voxels: int) -> "ti.Ndarray":
@@ -124,12 +130,13 @@ class _Ahead(Struct):
 
 @dataclass(frozen=True)
 class _Vote(RayVisitor):
-    """Adds what the rays of a keyframe say to its ``counts`` (pool * 512); ``belief`` (pool * 512) are
-    log-odds, of which those above ``learnt`` are likelier than by the prior."""
+    """Adds what the rays of a keyframe say to its ``counts`` and ``ends`` (pool * 512); ``belief`` (pool *
+    512) are log-odds, of which those above ``learnt`` are likelier than by the prior."""
 
     belief: F32Array
     learnt: F32
     counts: I64Array
+    ends: I32Array
 
     @ti.func
     def begin(self, sight: Template):
@@ -144,17 +151,26 @@ class _Vote(RayVisitor):
 
     @ti.func
     def end(self, ahead: Template, sight: Template, beyond: F32):
+        depth = sight.sensor.surface_depth(sight.measured, sight.noise)
+        sigma, inside = sight.noise.sigma(depth), depth > sight.begin and depth < sight.end
+        blur = sigma * sight.voxels_per_depth
+        if inside and blur <= BLURRED:
+            voxel = _voxel_at(sight.ray, depth, sight.space)
+            if voxel >= 0:
+                said = ENDED
+                if blur > SHARP:
+                    said = BLURRED_END
+                ti.atomic_max(self.ends[voxel], said)
+        surface, until = -1, depth - BEFORE_SIGMAS * sigma
         if ahead.surface >= 0 and ahead.explained > sight.model.floor:
-            ti.atomic_add(self.counts[ahead.surface], ti.cast(1, ti.i64))
-            voting = _Voting(self.counts, ahead.surface, sight.voxels_per_depth)
+            surface, until = ahead.surface, sight.end
+            ti.atomic_add(self.counts[surface], ti.cast(1, ti.i64))
+        if surface >= 0 or inside:
+            one = ti.cast(1, ti.i64) << _PASS
+            if surface < 0:
+                one = ti.cast(1, ti.i64) << _SILENT
+            voting = _Voting(self.counts, one, surface, until, sight.voxels_per_depth)
             walk_voxels(sight.ray, sight.begin, sight.end, sight.space, _vote_against, ahead, voting)
-        if ahead.largest <= UNEXPLAINED and beyond <= sight.model.floor:
-            depth = sight.sensor.surface_depth(sight.measured, sight.noise)
-            sharp = sight.noise.sigma(depth) * sight.voxels_per_depth <= SHARPEST_VOXELS
-            if sharp and depth > sight.begin and depth < sight.end:
-                voxel = _voxel_at(sight.ray, depth, sight.space)
-                if voxel >= 0:
-                    ti.atomic_add(self.counts[voxel], ti.cast(1, ti.i64) << _END)
 
 
 @ti.func
@@ -171,40 +187,52 @@ def _voxel_at(ray: Template, depth: F32, space: Template) -> I32:
 
 @dataclass(frozen=True)
 class _Voting(Bundle):
-    """A ray that votes, and what it votes for."""
+    """A ray, the count of one that passes, and where it passes no more: at a ``surface``, -1 for none, or at
+    a depth."""
 
     counts: I64Array
+    one: Template
     surface: I32
+    until: F32
     voxels_per_depth: F32
 
 
 @ti.func
 def _vote_against(state: Template, voting: Template, voxel: I32, near: F32, far: F32):
     """One voxel in front of the likeliest surface."""
-    before = ti.cast(voxel != voting.surface, ti.i32)
-    if before == 1 and (far - near) * voting.voxels_per_depth > GRAZED:
-        ti.atomic_add(voting.counts[voxel], ti.cast(1, ti.i64) << _PASS)
+    before = ti.cast(voxel != voting.surface and near <= voting.until, ti.i32)
+    if before == 1 and far <= voting.until and (far - near) * voting.voxels_per_depth > GRAZED:
+        ti.atomic_add(voting.counts[voxel], voting.one)
     return before
 
 
 @kernel
-def _tally(slots: I32Array, counts: I64Array, votes: I32Array, strip: Template) -> None:
+def _tally(
+    slots: I32Array, counts: I64Array, ends: I32Array, votes: I32Array, changing: I32, strip: Template
+) -> None:
     """Add what the rays of one keyframe say to the ``votes`` and scores (pool * 512 * VOTES) in the bricks in
-    ``slots`` (n) that it sees, and set its ``counts`` (pool * 512) there to 0."""
+    ``slots`` (n) that it sees, and set its ``counts`` and ``ends`` (pool * 512) there to 0. ``changing`` is 1
+    in a world that may change."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         _, first = strip_begin(part, slots, strip)
         for k in range(strip):
-            said = counts[first + k]
-            if said != 0:
-                counts[first + k] = 0
-                above, ended = said >> _PASS, said >> _END
+            voxel = first + k
+            said, ended = counts[voxel], ends[voxel]
+            if said != 0 or ended != 0:
+                counts[voxel], ends[voxel] = 0, 0
+                above, silent = said >> _PASS, said >> _SILENT
                 won = ti.cast(said - (above << _PASS), ti.i32)
-                passed = ti.cast(above - (ended << (_END - _PASS)), ti.i32)
-                votes[VOTES * (first + k)] += FOR * won - AGAINST * passed
-                if ended > 0:
-                    votes[VOTES * (first + k) + 1] += ENDED
-                elif won == 0:
-                    votes[VOTES * (first + k) + 1] -= ti.min(passed, PASSED)
+                against = ti.cast(above - (silent << (_SILENT - _PASS)), ti.i32)
+                passed = against + ti.cast(silent, ti.i32)
+                votes[VOTES * voxel] += FOR * won - AGAINST * against
+                score = votes[VOTES * voxel + 1]
+                if changing == 1:
+                    score -= score >> FADING
+                if ended == 0:
+                    score -= ti.min(passed, PASSED)
+                elif passed > 0:
+                    score += ended
+                votes[VOTES * voxel + 1] = score
 
 
 def call_winners(votes: "ti.Ndarray", log_odds: "ti.Ndarray", prior: float, min_evidence: float) -> None:
@@ -219,10 +247,22 @@ def called(prior_log_odds: float, min_evidence: float) -> float:
 
 
 @kernel
-def add_votes(slots: I32Array, more: I32Array, votes: I32Array) -> None:
-    """Add votes and scores ``more`` (n * 512 * VOTES) in the bricks in ``slots`` (n)."""
+def set_votes(slots: I32Array, those: I32Array, votes: I32Array) -> None:
+    """Set the votes and scores in the bricks in ``slots`` (n) to ``those`` (n * 512 * VOTES)."""
     for i in range(slots.shape[0] * VOXELS * VOTES):
-        votes[slots[i // (VOXELS * VOTES)] * (VOXELS * VOTES) + i % (VOXELS * VOTES)] += more[i]
+        votes[slots[i // (VOXELS * VOTES)] * (VOXELS * VOTES) + i % (VOXELS * VOTES)] = those[i]
+
+
+@kernel
+def move_votes(slots: I32Array, votes: I32Array, part: I32Array, back: I32) -> None:
+    """Copy the votes and scores in the bricks in ``slots`` (n) to those of a part of the map, (n * 512 *
+    VOTES) at least, or with ``back`` from there."""
+    for i in range(slots.shape[0] * VOXELS * VOTES):
+        here = slots[i // (VOXELS * VOTES)] * (VOXELS * VOTES) + i % (VOXELS * VOTES)
+        if back == 1:
+            votes[here] = part[i]
+        else:
+            part[i] = votes[here]
 
 
 @ti.kernel
@@ -232,82 +272,3 @@ def _call(votes: I32Array, log_odds: F32Array, learnt: F32, least: F32):
     for i in range(log_odds.shape[0]):
         if votes[VOTES * i] > 0 and log_odds[i] > learnt:
             log_odds[i] = ti.max(log_odds[i], least)
-
-
-def call_unexplained(
-    votes: "ti.Ndarray",
-    log_odds: "ti.Ndarray",
-    bricks: NDArray[np.int32],
-    slots: NDArray[np.int32],
-    prior: float,
-    min_evidence: float,
-) -> None:
-    """Change the ``log_odds`` (n), by which voxels have their states, where the scores say that there is
-    matter. An occupied voxel gets those of its score, one in doubt that was free the prior, which is unknown.
-    ``bricks`` (capacity, 3) are those of the map, which are in ``slots`` (m)."""
-    rule = prior + min_evidence, prior - min_evidence
-    found = np.zeros(len(slots), np.int32)
-    _find_doubted(slots, votes, log_odds, rule[0], found)
-    doubted = np.flatnonzero(found)
-    if not len(doubted):
-        return
-    order = np.argsort(grid_keys(bricks[slots]))
-    around = rows_around(bricks[slots[doubted]], grid_keys(bricks[slots[order]]))
-    around = np.where(around >= 0, slots[order][around], -1).astype(np.int32)
-    verdicts = ti.ndarray(ti.i32, len(doubted) * VOXELS)
-    _judge(slots[doubted], around.reshape(-1), votes, log_odds, *rule, verdicts)
-    _carry_out(slots[doubted], verdicts, votes, log_odds, prior, called(prior, min_evidence))
-    runtime.settle()
-
-
-_STAYS, _UNKNOWN, _MATTER = 0, 1, 2
-
-
-@kernel
-def _find_doubted(slots: I32Array, votes: I32Array, log_odds: F32Array, learnt: F32, found: I32Array) -> None:
-    """Mark the bricks in ``slots`` (n) with a voxel in doubt that is not occupied."""
-    for i in range(slots.shape[0]):
-        doubted = 0
-        for k in range(VOXELS):
-            voxel = slots[i] * VOXELS + k
-            if votes[VOTES * voxel + 1] > DOUBT and log_odds[voxel] <= learnt:
-                doubted = 1
-        found[i] = doubted
-
-
-@kernel
-def _judge(
-    slots: I32Array, around: I32Array, votes: I32Array, log_odds: F32Array, learnt: F32, free_below: F32,
-    verdicts: I32Array,
-) -> None:  # fmt: skip
-    """The verdict on each voxel of the bricks in ``slots`` (n), (n * 512), by its score and the occupied
-    voxels around it; ``around`` (n * 27) are the slots of the bricks around each."""
-    for i in range(slots.shape[0] * VOXELS):
-        place, voxel = i // VOXELS, slots[i // VOXELS] * VOXELS + i % VOXELS
-        score = votes[VOTES * voxel + 1]
-        verdicts[i] = _STAYS
-        if score > DOUBT and log_odds[voxel] <= learnt:
-            occupied, side = 0, 2 * NEIGHBOURS + 1
-            for k in range(side * side * side):
-                step = ti.Vector([k // (side * side), k // side % side, k % side]) - NEIGHBOURS
-                other = voxel_around(around, place, cell_of(i % VOXELS) + step)
-                if other >= 0 and log_odds[other] > ti.max(learnt, 0.0):
-                    occupied += 1
-            if score > MATTER and occupied <= ALONE:
-                verdicts[i] = _MATTER
-            elif log_odds[voxel] < free_below:
-                verdicts[i] = _UNKNOWN
-
-
-@kernel
-def _carry_out(
-    slots: I32Array, verdicts: I32Array, votes: I32Array, log_odds: F32Array, prior: F32, least: F32
-) -> None:
-    """Change the ``log_odds`` by the ``verdicts`` (n * 512) on the bricks in ``slots`` (n)."""
-    for i in range(slots.shape[0] * VOXELS):
-        voxel = slots[i // VOXELS] * VOXELS + i % VOXELS
-        if verdicts[i] == _MATTER:
-            evidence = prior + 0.1 * votes[VOTES * voxel + 1]
-            log_odds[voxel] = ti.max(ti.min(evidence, SUREST), least)
-        elif verdicts[i] == _UNKNOWN:
-            log_odds[voxel] = prior

@@ -1,15 +1,16 @@
 """What rays say of a voxel beyond its marginal, as the layer FIRST of a store: one byte.
 
 0 is nothing. WON is a voxel that is occupied by the vote of the rays, DOUBTED one that is not called free. A
-larger byte is a voxel that is occupied by its score, the byte plus SCORED (inference/surface_votes.py).
+larger byte is a voxel that is occupied by its score, in tenths of a nat the byte plus SCORED
+(inference/thin_matter.py).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-DOUBT, MATTER = 0, 60
-"""Scores, in tenths of a nat: above the first a voxel is in doubt. Above the second it is occupied: from two
-keyframes with ends on, with no more than one other that passes."""
+MATTER = 21
+"""Score, in tenths of a nat, from which on a voxel may be occupied by it: that of one keyframe with a sharp
+end in it, while in others no more than 36 rays pass."""
 
 SUREST = 5.0
 """Log-odds of a voxel that is occupied by its score, at most."""

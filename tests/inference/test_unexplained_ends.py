@@ -88,8 +88,19 @@ def test_scores_are_those_of_keyframes_with_ends_and_without() -> None:
     slots = topology.slots((cell // 8).astype(np.int32))
     inside = cell % 8
     number = (inside[:, 0] * 8 + inside[:, 1]) * 8 + inside[:, 2]
-    # Three keyframes see more than ten rays pass: each takes a nat away.
-    assert (scores[slots, number] == 7 * 39 - 3 * 10).all()
+    passing = np.array([[rays_through(k, x_m) for x_m in STEPS_M[~there]] for k in cell])
+    assert (passing > 10).all()
+    # A nat is 20: log(1 / .02) for an end, 1.5 against at most.
+    assert (scores[slots, number] == 7 * 78 - np.minimum(passing, 30).sum(axis=1)).all()
+
+
+def rays_through(voxel: NDArray[np.int64], x_m: float) -> int:
+    """How many rays of a camera at (x, 0, 0) lie in a voxel for more than a tenth of its size."""
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    to = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+    faces = (np.stack([voxel, voxel + 1]) * VOXEL - [x_m, 0, 0])[:, None, None] / to
+    inside = faces.max(axis=0).min(axis=-1) - faces.min(axis=0).max(axis=-1)
+    return int((inside * np.linalg.norm(to, axis=-1) > 0.1 * VOXEL).sum())
 
 
 @pytest.mark.usefixtures("backend")

@@ -1,5 +1,5 @@
 """Occupied voxels of an MRFMap: those whose marginal is over one half, those that win the vote of the rays,
-and those in which rays end that no voxel explains.
+and those that a thin thing goes through (inference/thin_matter.py).
 
 A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not, and yet
 the rays agree on where it is (inference/surface_votes.py). After a full :meth:`infer` all votes are counted
@@ -27,9 +27,9 @@ from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import PoolSnapshot, copied
 
 if TYPE_CHECKING:
-    from taichi_mrf.inference import surface_votes
+    from taichi_mrf.inference import dated, surface_votes, thin_matter
 else:
-    (surface_votes,) = later("taichi_mrf.inference", "surface_votes")
+    dated, surface_votes, thin_matter = later("taichi_mrf.inference", "dated", "surface_votes", "thin_matter")
 
 AT_ONCE = 16
 """Keyframes whose votes are counted together: they share what their rays read of the map."""
@@ -73,18 +73,16 @@ class Decisions:
         runtime.settle()
         return log_odds
 
-    def call_unexplained(self, log_odds: "ti.Ndarray") -> None:
-        """Change :meth:`log_odds` where rays end that no voxel explains (surface_votes.call_unexplained).
-        Scores have no dates: in a world that may change, they would bring back what has gone."""
-        pool = self._registry.pool
-        if pool.dated is None:
-            known = pool.prior_log_odds, self._sweeper.volume.min_evidence
-            surface_votes.call_unexplained(self._votes, log_odds, pool.bricks, pool.in_use, *known)
+    def call_matter(self, log_odds: "ti.Ndarray") -> None:
+        """Change :meth:`log_odds` where something stops single rays (thin_matter.call_matter)."""
+        pool, sweeper = self._registry.pool, self._sweeper
+        known = pool.prior_log_odds, sweeper.volume.min_evidence
+        thin_matter.call_matter(self._votes, log_odds, pool.bricks, pool.in_use, sweeper.voxel_size, *known)
 
     def calls(self, settled: bool) -> NDArray[np.uint8]:
         """What rays say of voxels beyond the marginals, (slots, 512) (voxels/calls.py)."""
         log_odds, pool = self.log_odds(settled), self._registry.pool
-        self.call_unexplained(log_odds)
+        self.call_matter(log_odds)
         known = pool.prior_log_odds, self._sweeper.volume.min_evidence
         calls = calls_of(log_odds.to_numpy(), pool.belief.to_numpy(), *known)
         return calls[: pool.capacity * VOXELS].reshape(-1, VOXELS)
@@ -98,17 +96,30 @@ class Decisions:
         pool = self._registry.pool
         gone = any(self._keyframes.get(id) is not keyframe for id, keyframe in self._counted.items())
         other_beliefs = self._restarts != pool.restarts or self._shown is not pool.shown
-        if gone or other_beliefs or (settled and not self._exact):
+        if gone or other_beliefs or self._comes_late() or (settled and not self._exact):
             self._start_over()
         else:
             self._follow_bricks()
-        new = {id: k for id, k in self._keyframes.items() if id not in self._counted}
+        new = [keyframe for id, keyframe in self._keyframes.items() if id not in self._counted]
+        new = dated.in_time(new) if self._changing else new
         self._exact = settled if new else self._exact
         for begin in range(0, len(new), AT_ONCE):
-            some = dict(list(new.items())[begin : begin + AT_ONCE])
-            self._add(list(some.values()), between)
-            self._counted.update(some)
+            some = new[begin : begin + AT_ONCE]
+            self._add(some, between)
+            self._counted.update((keyframe.id, keyframe) for keyframe in some)
         self._restarts, self._shown = pool.restarts, pool.shown
+
+    @property
+    def _changing(self) -> bool:
+        """True in a world that may change, where scores fade from keyframe to keyframe."""
+        return self._registry.pool.dated is not None
+
+    def _comes_late(self) -> bool:
+        """True if scores fade, and a new keyframe is older than one that was counted."""
+        if not self._changing or not self._counted:
+            return False
+        newest_s = max(keyframe.stamp_s for keyframe in self._counted.values())
+        return any(k.stamp_s <= newest_s for id, k in self._keyframes.items() if id not in self._counted)
 
     def _start_over(self) -> None:
         """Forget all votes but those that frozen keyframes have left."""
@@ -118,7 +129,11 @@ class Decisions:
         self._identity = pool.identity.copy()
         if len(kept.bricks):
             slots = self._registry.topology.slots(kept.bricks)
-            surface_votes.add_votes(slots[slots >= 0], kept.sums[slots >= 0].reshape(-1), self._votes)
+            sums = kept.sums[slots >= 0].reshape(-1, VOTES)
+            if self._changing:
+                most = surface_votes.LASTING
+                sums = np.stack([sums[:, 0], np.clip(sums[:, 1], -most, most)], axis=1)
+            surface_votes.set_votes(slots[slots >= 0], np.ascontiguousarray(sums.reshape(-1)), self._votes)
 
     def _add(self, keyframes: Sequence[Keyframe], between: Callable[[], object]) -> None:
         """Add the votes of some keyframes' rays. Only the bricks that they see are looked at."""
@@ -127,12 +142,13 @@ class Decisions:
         part = self._registry.pool.part(slots)
         places = [np.searchsorted(slots, visible.slots).astype(np.int32) for visible in lists]
         seen = [replace(visible, slots=at, arrays=None) for visible, at in zip(lists, places, strict=True)]
-        model = self._sweeper.model()
-        votes = surface_votes.count_votes(
-            zip(keyframes, seen, strict=True), part, model, self._sweeper.volume, between
-        )
-        more = votes.to_numpy()[: len(slots) * VOXELS * VOTES]
-        surface_votes.add_votes(slots, more, self._votes)
+        votes = surface_votes.no_votes(part.belief.shape[0])
+        surface_votes.move_votes(slots, self._votes, votes, 0)
+        surface_votes.count_votes(
+            zip(keyframes, seen, strict=True), part, self._sweeper.model(), self._sweeper.volume, votes,
+            self._changing, between,
+        )  # fmt: skip
+        surface_votes.move_votes(slots, self._votes, votes, 1)
 
     def _follow_bricks(self) -> None:
         """Forget the votes of bricks that are gone, and make room for new ones."""
@@ -144,4 +160,4 @@ class Decisions:
         kept = np.flatnonzero(before == self._identity[: len(before)]).astype(np.int32)
         votes = old.to_numpy().reshape(-1, VOXELS * VOTES)[kept]
         self._votes = surface_votes.no_votes(pool.belief.shape[0])
-        surface_votes.add_votes(kept, votes.reshape(-1), self._votes)
+        surface_votes.set_votes(kept, votes.reshape(-1), self._votes)

@@ -57,7 +57,7 @@ def decide(m: OccupancyMap, parts: MapParts, between: Callable[[], object] = lam
             known = parts.pool.prior_log_odds, m.view.volume.min_evidence
             carry(calibrated_log_odds(parts, between), log_odds, *known, called(*known))
             runtime.settle()
-        parts.decisions.call_unexplained(log_odds)
+        parts.decisions.call_matter(log_odds)
         return log_odds
 
     # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.

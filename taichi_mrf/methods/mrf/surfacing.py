@@ -12,7 +12,7 @@ from taichi_mrf.inference.brick_sums import VOTES, BrickSums
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
-from taichi_mrf.inference.surface_votes import count_votes
+from taichi_mrf.inference.surface_votes import count_votes, no_votes
 from taichi_mrf.methods.mrf.kept_rays import STEPS, RayShare
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.queries.colored import blended_colors
@@ -104,9 +104,10 @@ def keep_rays(parts: MapParts, keyframe: Keyframe) -> None:
     seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]
     field = SurfaceRays(part, _model_of(parts), volume).field(seen)
     sums = np.rint(field.sums * STEPS).astype(np.int32)
-    votes = count_votes(seen, part, parts.sweeper.model(), volume).to_numpy().reshape(-1, VOXELS, VOTES)
-    bricks = parts.pool.bricks[visible.slots]
-    share = RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes[: len(bricks)]))
+    votes = no_votes(part.belief.shape[0])
+    count_votes(seen, part, parts.sweeper.model(), volume, votes)
+    bricks, said = parts.pool.bricks[visible.slots], votes.to_numpy().reshape(-1, VOXELS, VOTES)
+    share = RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, said[: len(bricks)]))
     if parts.registry.before_claim is not None:  # what is outside of the window comes back
         parts.registry.before_claim(share.distances.bricks)
     parts.kept.restore(share)
