@@ -79,7 +79,8 @@ class Frontiers:
 
 def find_frontiers(m: VoxelMap, min_voxels: int = 1) -> Frontiers:
     """All free voxels that share a face with an unknown one. Those that touch, even at a corner, form one
-    cluster; clusters of less than ``min_voxels`` are left out.
+    cluster; clusters of less than ``min_voxels`` are left out. A voxel that was seen well, but is in doubt
+    because some rays end in it (inference/thin_matter.py), is no place to explore.
 
     The map is read chunk by chunk, so that memory is bounded by the result. Raises ConfigError for min_voxels
     below 1.
@@ -94,13 +95,13 @@ def find_frontiers(m: VoxelMap, min_voxels: int = 1) -> Frontiers:
 
 def frontier_voxels(m: VoxelMap) -> NDArray[np.int32]:
     """Coordinates (n, 3) of the free voxels that share a face with an unknown one, ascending by chunk."""
-    m = m.decided
-    reader = BrickReader(m)
+    decided, by_marginals = BrickReader(m.decided), BrickReader(m)
     found = [np.zeros((0, 3), np.int32)]
-    for chunk in sorted_bricks(known_bricks(m) // CHUNK).astype(np.int64):
+    for chunk in sorted_bricks(known_bricks(m.decided) // CHUNK).astype(np.int64):
         first = chunk * CHUNK_VOXELS
-        state = voxel_box(m, first - 1, first + CHUNK_VOXELS + 1, reader).state
-        unknown = state == UNKNOWN
+        around = first - 1, first + CHUNK_VOXELS + 1
+        state = voxel_box(m.decided, *around, decided).state
+        unknown = (state == UNKNOWN) & (voxel_box(m, *around, by_marginals).state == UNKNOWN)
         beside = np.zeros((CHUNK_VOXELS,) * 3, np.bool_)
         for axis in range(3):
             for step in (0, 2):

@@ -14,14 +14,16 @@ def by_search(m: HandMap, voxel_size: float) -> dict[tuple[int, ...], int]:
     """Frontier voxels with the number of their cluster, found by flooding."""
     lower, upper = map_extent(m)
     found = read_box(m, lower - 2 * voxel_size, upper + 2 * voxel_size)
-    state = found.state
+    state, prior, least = found.state, m.view.pool.prior_log_odds, m.view.volume.min_evidence
+    occupied = (found.log_odds > 0) & (np.abs(found.log_odds - prior) > least)
+    explored = occupied | (found.log_odds < prior - least)  # by the marginals, whatever its state is
     frontier = set()
     for voxel in np.argwhere(state[1:-1, 1:-1, 1:-1] == 1) + 1:
         for axis in range(3):
             for step in (-1, 1):
                 beside = voxel.copy()
                 beside[axis] += step
-                if state[tuple(beside)] == 0:
+                if state[tuple(beside)] == 0 and not explored[tuple(beside)]:
                     frontier.add(tuple((voxel + found.lowest).tolist()))
     cluster: dict[tuple[int, ...], int] = {}
     for number, seed in enumerate(sorted(frontier)):

@@ -1,4 +1,4 @@
-"""Things that are thinner than a voxel: rays that end on them are few, and no voxel explains them."""
+"""Things that are thinner than a voxel: rays that end on them are few, and others outvote them."""
 
 import zipfile
 from pathlib import Path
@@ -8,7 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise, load_map
+from taichi_mrf.config.sections import LIVE_HALF_LIFE_S, TimeConfig
+from taichi_mrf.inference.thin_matter import call_matter
 from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.npz_file import MANIFEST, manifest_lines
 
 CAMERA = PinholeCamera(96, 72, 80.0, 80.0, 47.5, 35.5)
@@ -122,6 +125,27 @@ def test_order_freezing_and_a_file_keep_the_post(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("backwards", [False, True])
+def test_in_a_world_that_may_change_a_post_is_found_and_then_forgotten(backwards: bool) -> None:
+    """Thirty views with it, the others without: what they say fades by an eighth with each."""
+    there = np.arange(60) < 30
+    stamps = np.arange(60)[::-1] if backwards else np.arange(60)
+    m = MRFMap(VOXEL, NOISE, time=TimeConfig(half_life_s=LIVE_HALF_LIFE_S))
+    states = []
+    for i in stamps:
+        x_m = STEPS_M[i % len(STEPS_M)]
+        m.add_keyframe(depth_image(x_m, bool(there[i])), pose(x_m), CAMERA, f"{i}", float(i))
+        if not backwards and i in (29, 59):
+            m.infer()
+            states.append(m.state(post_points()))
+    m.infer()
+    assert (m.state(post_points()) == FREE).all()
+    if not backwards:
+        assert (states[0] == OCCUPIED).all()
+        assert (states[1] == FREE).all()
+
+
+@pytest.mark.usefixtures("backend")
 def test_just_before_a_larger_surface_a_post_makes_a_voxel_unknown() -> None:
     m, post_m = MRFMap(VOXEL, NOISE), 1.93
     for i, x_m in enumerate(STEPS_M):
@@ -152,3 +176,67 @@ def test_a_file_whose_frozen_keyframes_left_no_scores_is_read(tmp_path: Path) ->
     np.testing.assert_array_equal(old.state(wall), new.state(wall))
     assert (new.state(post_points()) == OCCUPIED).all()
     assert not (old.state(post_points()) == OCCUPIED).any()
+
+
+def verdicts_by_numpy(
+    occupied: NDArray[np.bool_], score: NDArray[np.int64], reach: int, most: int
+) -> NDArray[np.int8]:
+    """2 for voxels of a box that are occupied by their score, 1 for others in doubt, 0 for all others."""
+    matter = occupied | (score > 0)
+    enough = (score // 2 >= 21) & ~occupied
+
+    def number(of: NDArray[np.bool_], *within: int) -> NDArray[np.int64]:
+        padded = np.pad(of.astype(np.int64), [(w, w) for w in within])
+        sizes = tuple(2 * w + 1 for w in within)
+        return np.lib.stride_tricks.sliding_window_view(padded, sizes).sum(axis=(3, 4, 5))
+
+    rods = np.zeros(occupied.shape, bool)
+    for axis in range(3):
+        within = [reach] * 3
+        within[axis] = 0
+        filled = np.moveaxis(number(matter, *within), axis, 0)
+        thin_layer = (filled > 0) & (filled <= most)
+        for column in np.ndindex(thin_layer.shape[1:]):
+            row = thin_layer[(slice(None), *column)]
+            for begin in range(len(row) - reach):
+                if row[begin : begin + reach + 1].all():
+                    np.moveaxis(rods, axis, 0)[(slice(begin, begin + reach + 1), *column)] = True
+    found = enough & (rods | (number(occupied, 3, 3, 3) <= 3))
+    for _ in range(2):
+        found |= enough & (number(found, 1, 1, 1) > 0) & (number(occupied, 1, 1, 1) <= 3)
+    return np.where(found, 2, (score > 0) & ~occupied).astype(np.int8)
+
+
+@pytest.mark.compilers
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("voxel_size", [0.2, 0.05, 0.02])
+def test_what_scores_decide_is_what_numpy_finds(voxel_size: float) -> None:
+    """Rods, plates and crumbs in a box of 3^3 bricks, in any order of slots, with nothing around it."""
+    draw = np.random.default_rng(5)
+    side, prior, least = 24, -2.2, 0.1
+    occupied, score = np.zeros((side,) * 3, bool), np.full((side,) * 3, -9, np.int64)
+    occupied[:, :, 2] = True
+    score[:, :, 3][draw.random((side, side)) < 0.5] = 60
+    occupied[4:9, 4:9, 12:15] = True
+    for x, y, width in ((15, 4, 1), (15, 18, 2), (5, 17, 4)):
+        score[x : x + width, y : y + width, 3:22] = draw.integers(30, 90, (width, width, 19))
+    crumbs = draw.integers(3, side, (60, 3))
+    score[tuple(crumbs.T)] = draw.integers(-20, 90, 60)
+    log_odds = np.where(occupied, 2.0, -5.0).astype(np.float32)
+
+    bricks = np.stack(np.unravel_index(draw.permutation(27), (3, 3, 3)), axis=1).astype(np.int32)
+    cells = np.stack(np.unravel_index(np.arange(512), (8, 8, 8)), axis=1)
+    places = tuple((bricks[:, None] * 8 + cells).reshape(-1, 3).T)
+    votes, values = ti.ndarray(ti.i32, 2 * 27 * 512), ti.ndarray(ti.f32, 27 * 512)
+    votes.from_numpy(np.stack([0 * score[places], score[places]], axis=1).reshape(-1).astype(np.int32))
+    values.from_numpy(log_odds[places])
+    call_matter(votes, values, bricks, np.arange(27, dtype=np.int32), voxel_size, prior, least)
+
+    reach, most = {0.2: (3, 4), 0.05: (4, 5), 0.02: (6, 20)}[voxel_size]
+    wanted = verdicts_by_numpy(occupied, score, reach, most)[places]
+    decided, was = values.to_numpy(), log_odds[places]
+    assert {0, 1, 2} == set(wanted.tolist())
+    evidence = np.clip(prior + 0.1 * (score[places] // 2), 0.01, 5.0)  # above even odds, at most sure
+    np.testing.assert_allclose(decided[wanted == 2], evidence[wanted == 2], rtol=1e-6)
+    np.testing.assert_array_equal(decided[wanted == 1], np.float32(prior))
+    np.testing.assert_array_equal(decided[wanted == 0], was[wanted == 0])
