@@ -133,6 +133,30 @@ def test_what_is_frozen_keeps_its_colours() -> None:
         np.testing.assert_array_equal(m.colors(scene.probes()), before)
 
 
+@pytest.mark.parametrize("settled", [True, False])
+def test_colours_of_bricks_that_are_gone_go_with_them(tmp_path: Path, settled: bool) -> None:
+    """The wall lies at a face between bricks: the frozen view sees the nearer ones, which the others own."""
+    m, camera = MRFMap(0.05, PolynomialNoise((0.002,))), PinholeCamera(64, 64, 60.0, 60.0, 31.5, 31.5)
+    red, green = np.zeros((*camera.shape, 3), np.uint8), np.zeros((*camera.shape, 3), np.uint8)
+    red[..., 0], green[..., 1] = 200, 200
+    frozen = m.add_keyframe(np.full(camera.shape, 2.008), np.eye(4), camera, color=red)
+    others = [m.add_keyframe(np.full(camera.shape, 1.99), np.eye(4), camera, color=green) for _ in range(3)]
+    m.infer()
+    nearer, farther = [[0.02, 0.02, 1.975]], [[0.02, 0.02, 2.025]]
+    assert (m.colors(nearer + farther)[:, 3] > 0).all()
+    m.freeze_keyframe(frozen)
+    for id in others:
+        m.remove_keyframe(id)
+    if settled:
+        m.infer()
+        assert m.colors(nearer)[0, 3] == 0
+        np.testing.assert_array_equal(m.colors(farther)[0, :3], (200, 0, 0))
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    loaded.infer()
+    np.testing.assert_array_equal(loaded.colors(farther)[0, :3], (200, 0, 0))
+
+
 def test_nothing_smears_onto_what_stands_behind() -> None:
     """The image of the thing reaches over the wall behind it, whose voxels other views see."""
     m = scene.build([0, 1, 2, 3, 4, 5])

@@ -157,8 +157,14 @@ class MapColors:
     def _of_frozen(self) -> ColorSums:
         sums = ColorSums(self._registry.pool)
         if len(self.frozen.numbers):
-            sums.add(self.frozen, self._registry.topology.slots(self.frozen.bricks))
+            left = self.left()
+            sums.add(left, self._registry.topology.slots(left.bricks))
         return sums
+
+    def left(self) -> ColorShare:
+        """What frozen keyframes gave to the voxels that there still are: a brick that they only saw goes with
+        the last keyframe that has it."""
+        return self.frozen.chosen(self._registry.topology.slots(self.frozen.bricks) >= 0)
 
     def _inside(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
         return np.isin(grid_keys(self.frozen.bricks // CHUNK), grid_keys(chunks))
