@@ -6,6 +6,7 @@ so any history of adding, removing and moving keyframes ends in the map of the f
 """
 
 import hashlib
+import struct
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
@@ -84,12 +85,12 @@ def driven(
 
 def content_key(keyframe: Keyframe) -> bytes:
     """Content of a keyframe, as bytes to sort by: measurement, pose, camera and what it states of its
-    measurements, but not its number."""
+    measurements, but not its number. Of keyframes that are the same, their stamps decide."""
     digest = hashlib.blake2b(keyframe.T_world_camera.tobytes(), digest_size=16)
     digest.update(repr(keyframe.camera).encode())
     digest.update(on_host(keyframe.image.depth).tobytes())
     digest.update(keyframe.own.content())
-    return digest.digest()
+    return digest.digest() + struct.pack(">d", keyframe.stamp_s)
 
 
 def sweep_steps(

@@ -211,6 +211,14 @@ class BrickPool:
         finally:
             self._shown, self.bricks, self.owners, self.shown = now
 
+    def with_beliefs(self, belief: "ti.Ndarray") -> "BrickPool":
+        """The bricks as they are now, with these log-odds (capacity * 512), whatever is shown instead of the
+        pool's own. It is for queries alone."""
+        other = copy.copy(self)
+        other.dated, other.total, other._shown = None, belief, None
+        other.bricks, other.owners = self.bricks.copy(), self.owners.copy()
+        return other
+
     def keep_evidence(self) -> "ti.Ndarray":
         """The evidence channel, made when something is frozen for the first time."""
         if self.evidence is None:

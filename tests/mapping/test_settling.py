@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.points import OCCUPIED
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -106,6 +109,25 @@ def test_the_map_before_is_shown_between_the_steps_and_comes_back_after_an_error
     np.testing.assert_array_equal(marginals(m), before)
     m.infer()
     np.testing.assert_array_equal(marginals(m), marginals(small_room.build(range(KEYFRAMES))))
+
+
+def test_what_is_decided_while_a_map_settles_is_what_was_decided_before() -> None:
+    """With a sigma of three voxels no marginal is over one half, and the votes alone find the wall."""
+    m, draw = MRFMap(0.02, PolynomialNoise((0.06,))), np.random.default_rng(0)
+    camera = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
+    for x_m in np.linspace(-0.3, 0.3, 5):
+        T_world_camera = np.eye(4)
+        T_world_camera[0, 3] = x_m
+        depth_m = 3.02 + 0.06 * draw.standard_normal(camera.shape)
+        m.add_keyframe(depth_m.astype(np.float32), T_world_camera, camera)
+    m.infer()
+    wanted = m.decided.voxels(0.5)[0]
+    assert len(wanted) > 3 * len(m.voxels(0.5)[0])
+    with FullInference(m, keep_before=True) as inference:
+        next(iter(inference))
+        with inference.showing_before():
+            np.testing.assert_array_equal(m.decided.voxels(0.5)[0], wanted)
+            np.testing.assert_array_equal(m.state(wanted), OCCUPIED)
 
 
 def test_a_rebuilt_map_ends_where_it_is_told_and_stays_stale() -> None:

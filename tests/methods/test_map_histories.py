@@ -29,10 +29,26 @@ def assert_same_map(a: MRFMap, b: MRFMap) -> None:
     assert (a.state(probes) == b.state(probes)).mean() >= 0.999
 
 
+WALL_CAMERA = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
+
 steps = st.lists(
     st.tuples(st.sampled_from(["add", "remove", "move", "infer", "infer one"]), st.integers(0, 9)),
     max_size=12,
 )
+
+
+def test_frames_that_differ_in_their_stamps_alone_may_come_in_any_order() -> None:
+    """With a half-life the order in time counts: something is there between two views of the same wall."""
+    wall = np.full(WALL_CAMERA.shape, 3.02, np.float32)
+    frames = [(wall, 0.0), (wall, 300.0), (np.minimum(wall, 1.5), 310.0), (wall, 320.0)]
+    maps = [MRFMap(0.05, time=TimeConfig(half_life_s=100.0)) for _ in range(2)]
+    for m, order in zip(maps, (frames, frames[::-1]), strict=True):
+        for depth_m, stamp_s in order:
+            m.add_keyframe(depth_m, np.eye(4), WALL_CAMERA, stamp_s=stamp_s)
+        m.infer()
+    (centres, p), (_, other) = (m.voxels(0.0) for m in maps)
+    np.testing.assert_array_equal(p, other)
+    np.testing.assert_array_equal(maps[0].state(centres), maps[1].state(centres))
 
 
 @settings(max_examples=12)

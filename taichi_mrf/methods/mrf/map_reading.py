@@ -1,6 +1,5 @@
 """A map to be queried and exported, but not changed: other beliefs over the bricks of an MRFMap."""
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,9 +63,7 @@ class MapReading(BrickMap):
         self._source, self._parts, self._rays = source, parts, rays
         self._registry, self._version, self._up = parts.registry, parts.registry.version, source.up
         self.seen_free_log_odds = source.seen_free_log_odds
-        self._pool = copy.copy(parts.pool)
-        self._pool.dated, self._pool.total = None, belief
-        self._pool.bricks, self._pool.owners = parts.pool.bricks.copy(), parts.pool.owners.copy()
+        self._pool = parts.pool.with_beliefs(belief)
         shown = source.view
         self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)
 
