@@ -13,7 +13,7 @@ from oracles.forward import Noise
 
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.inference.color_sums import WEIGHT_STEPS, ColorShare
+from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -21,6 +21,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+
+# Written out, and not imported: these tests hold the value.
+WEIGHT_STEPS = 255 / 32
 
 pytestmark = pytest.mark.usefixtures("backend")
 
