@@ -302,9 +302,9 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         unchanged."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise, own=record.own)
         footprint = self._reach(image, record.T_world_camera)
-        self._fade(record.stamp_s)
         self._registry.anchor_at(record.T_world_camera[:3, 3])
         self._registry.claim(footprint)
+        self._fade(record.stamp_s)  # from here on nothing fails
         slots = self._registry.visible(footprint).slots
         if len(slots):
             self._integrate(Scan(image, record.T_world_camera, footprint, slots))

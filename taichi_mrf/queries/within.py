@@ -208,6 +208,11 @@ def _free_along(axis: Template, centre: Vec3, a: I32, b: I32, half: F32, voxels:
                 t = upper
         else:
             everywhere = voxels.unknown if slot == _UNKNOWN else voxels.free
-            free *= ti.pow(1.0 - everywhere, leave - t)
+            whole = ti.floor(leave) - ti.ceil(t)
+            if whole < 0.0:
+                free *= 1.0 - everywhere * (leave - t)
+            else:
+                free *= 1.0 - everywhere * (ti.ceil(t) - t)
+                free *= ti.pow(1.0 - everywhere, whole) * (1.0 - everywhere * (leave - ti.floor(leave)))
             t = leave
     return free * ti.max(0.0, 1.0 - surface)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from oracles.traversal import segments
 
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.config.sections import LogOddsConfig
+from taichi_mrf.config.sections import LogOddsConfig, TimeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.geometry.poses import Pose, look_at
@@ -282,13 +282,16 @@ def test_an_impossible_parameter_is_named() -> None:
 
 
 def test_a_scan_that_does_not_fit_changes_nothing() -> None:
-    m = LogOddsMap(0.05, volume=VolumeConfig(memory_limit_gb=0.0006))
+    """Not even the time passes until it."""
+    time = TimeConfig(half_life_s=1.0)
+    m = LogOddsMap(0.05, volume=VolumeConfig(memory_limit_gb=0.0006), time=time)
     m.add_keyframe(np.where(np.indices(CAMERA.shape)[0] == 9, 0.5, 0.0).astype(np.float32), np.eye(4), CAMERA)
     before, size = m.voxels(0.0), m.statistics()
     with pytest.raises(CapacityError, match="larger voxels"):
-        m.add_keyframe(np.full(CAMERA.shape, 3.0, np.float32), np.eye(4), CAMERA)
+        m.add_keyframe(np.full(CAMERA.shape, 3.0, np.float32), np.eye(4), CAMERA, stamp_s=3.0)
     assert m.statistics() == size
-    np.testing.assert_array_equal(m.voxels(0.0)[0], before[0])
+    for now, then in zip(m.voxels(0.0), before, strict=True):
+        np.testing.assert_array_equal(now, then)
 
 
 def octomap_voxels(

@@ -46,9 +46,8 @@ def expected(hand: HandMap, centre_m: np.ndarray, radius_m: float) -> float:
                 start = centre_m + beside - math.sqrt(squared) * along
                 cells, near, far = segments(start, along, 0.0, 2 * math.sqrt(squared), VOXEL)
                 m, length = 1 / (1 + np.exp(-hand.true_log_odds(cells))), (far - near) / VOXEL
-                no_brick = np.isnan(hand.hand.at(cells.astype(np.int64)))
                 evidence = hand.true_log_odds(cells).astype(np.float32) > np.float32(PRIOR)
-                rest = np.where(no_brick, (1 - m) ** length, 1 - m * length)[~evidence].prod()
+                rest = (1 - m * length)[~evidence].prod()
                 likeliest = max(likeliest, 1 - max(0.0, 1 - (m * length)[evidence].sum()) * rest)
         of_axes.append(likeliest)
     return min(of_axes)
