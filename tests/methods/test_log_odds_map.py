@@ -282,14 +282,26 @@ def test_an_impossible_parameter_is_named() -> None:
 
 
 def test_a_scan_that_does_not_fit_changes_nothing() -> None:
-    """Not even the time passes until it."""
-    time = TimeConfig(half_life_s=1.0)
-    m = LogOddsMap(0.05, volume=VolumeConfig(memory_limit_gb=0.0006), time=time)
+    m = LogOddsMap(0.05, volume=VolumeConfig(memory_limit_gb=0.0006))
     m.add_keyframe(np.where(np.indices(CAMERA.shape)[0] == 9, 0.5, 0.0).astype(np.float32), np.eye(4), CAMERA)
     before, size = m.voxels(0.0), m.statistics()
     with pytest.raises(CapacityError, match="larger voxels"):
-        m.add_keyframe(np.full(CAMERA.shape, 3.0, np.float32), np.eye(4), CAMERA, stamp_s=3.0)
+        m.add_keyframe(np.full(CAMERA.shape, 3.0, np.float32), np.eye(4), CAMERA)
     assert m.statistics() == size
+    np.testing.assert_array_equal(m.voxels(0.0)[0], before[0])
+
+
+def test_a_scan_for_which_there_are_no_bricks_lets_no_time_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    m = LogOddsMap(0.05, time=TimeConfig(half_life_s=1.0))
+    m.add_keyframe(np.full(CAMERA.shape, 1.0, np.float32), np.eye(4), CAMERA)
+    before = m.voxels(0.0)
+
+    def refuse(*_: object) -> None:
+        raise CapacityError("no room")
+
+    monkeypatch.setattr(m._registry, "claim", refuse)
+    with pytest.raises(CapacityError, match="no room"):
+        m.add_keyframe(np.full(CAMERA.shape, 3.0, np.float32), np.eye(4), CAMERA, stamp_s=3.0)
     for now, then in zip(m.voxels(0.0), before, strict=True):
         np.testing.assert_array_equal(now, then)
 
