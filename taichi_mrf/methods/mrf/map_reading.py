@@ -64,6 +64,7 @@ class MapReading(BrickMap):
         self._source, self._parts, self._rays = source, parts, rays
         self._registry, self._version, self._up = parts.registry, parts.registry.version, source.up
         self.seen_free_log_odds = source.seen_free_log_odds
+        self.promise = source.promise
         self._pool = copy.copy(parts.pool)
         self._pool.dated, self._pool.total = None, belief
         self._pool.bricks, self._pool.owners = parts.pool.bricks.copy(), parts.pool.owners.copy()
