@@ -21,6 +21,8 @@ from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.points import FREE, checked_points, state_of
 from taichi_mrf.queries.within import path_places
+from taichi_mrf.sensor.distortion import DistortedCamera
+from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system.compiler import ti
 
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999)
@@ -90,13 +92,27 @@ class FreePromise:
         )
 
 
-_DEFAULT_BOUNDS = {"depth camera": (-3.0,) * len(LEVELS), "lidar": (-3.0,) * len(LEVELS)}
+_DEFAULT_BOUNDS = {
+    "depth camera": (-3.5, -4.375, -5.0, -8.5, -9.0, -9.0, -9.0, -12.0),
+    "lidar": (-2.375, -3.625, -4.125, -5.75, -6.75, -9.0, -9.0, -9.0),
+}
+"""Bounds of LEVELS for an MRFMap that was not calibrated, in voxels of 5 cm. Depth camera: the lowest of the
+house, the room, the coffin scene, rooms with thin things and the kitchen, which is the lowest at each level,
+because its poses are off by a part of a voxel. Lidar: the building."""
 
 
 def default_promise(m: Any) -> FreePromise:
-    """The bounds of a map that was not calibrated, by the sensor of its first keyframe."""
+    """The bounds of a map that was not calibrated, by the camera of its keyframes. Raises ConfigError for a
+    map of another method than mrf: its log-odds have no table."""
+    if m.config.method != "mrf":
+        raise ConfigError(
+            f"a map of the method {m.config.method} has no default for levels of free space: calibrate it "
+            "with taichi_mrf.evaluation.free_space.calibrate_free"
+        )
+    cameras = (getattr(k, "camera", None) for k in m.keyframes.values())
+    by_lidar = any(isinstance(c, RayTable) and not isinstance(c, DistortedCamera) for c in cameras)
+    bound = np.array(_DEFAULT_BOUNDS["lidar" if by_lidar else "depth camera"])
     nothing = np.full(len(LEVELS), np.nan)
-    bound = np.array(_DEFAULT_BOUNDS["depth camera"])
     return FreePromise(np.array(LEVELS), bound, nothing, nothing, nothing, blocks=0)
 
 

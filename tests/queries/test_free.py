@@ -171,4 +171,6 @@ def test_maps_without_held_out_frames_have_the_default_table() -> None:
     points = some_points(m, 2000)
     shares = [m.free_with(points, level).mean() for level in (0.8, 0.9, 0.95, 0.99)]
     assert shares == sorted(shares, reverse=True)
-    assert shares[-1] > 0
+    assert shares[0] > shares[-1] > 0
+    with pytest.raises(ConfigError, match="log_odds has no default"):
+        room_map("log_odds").free_with(points)
