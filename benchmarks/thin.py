@@ -219,7 +219,8 @@ def measure(
     if not real.all():
         tree = cKDTree(_unpacked(truth.matter))
         apart[~real] = np.rint(tree.query(occupied[~real], p=np.inf)[0]).astype(int)
-    inside = scene.inner.touched_by((occupied + 0.5) * m.voxel_size, 0.5 * m.voxel_size)
+    centres_m = (occupied.astype(np.float64) + 0.5) * m.voxel_size
+    inside = scene.inner.touched_by(centres_m, 0.5 * m.voxel_size)
     pixels = _held_out_pixels(m, scene, sensor, held_out)
     return {
         "occupied": len(keys),

@@ -42,7 +42,8 @@ def crossings(scene: Scene, sensor: Sensor, views: list[View]) -> list[Crossing]
     of_thing = np.concatenate([view.thing[view.depth_m > 0] for view in views])
     order = np.argsort(of_thing, kind="stable")
     starts = np.searchsorted(of_thing[order], np.arange(len(scene.things) + 1))
-    found, by_kind = [], {thing.kind: [] for thing in scene.thin}
+    found: list[Crossing] = []
+    by_kind: dict[str, list[int]] = {thing.kind: [] for thing in scene.thin}
     for i, thing in enumerate(scene.things):
         if thing.kind in by_kind:
             by_kind[thing.kind].append(i)

@@ -227,7 +227,7 @@ def voxels_of(shape: Shape, voxel_size: float) -> NDArray[np.int64]:
 
 def _touched(shape: Shape, voxels: NDArray[np.int64], voxel_size: float) -> NDArray[np.bool_]:
     """Which of some voxels (N, 3) a shape has a point in, (N,)."""
-    centres_m, half = (voxels + 0.5) * voxel_size, 0.5 * voxel_size
+    centres_m, half = (voxels.astype(np.float64) + 0.5) * voxel_size, 0.5 * voxel_size
     distance = shape.distance(centres_m)
     touched = distance <= half  # a ball in the voxel touches
     doubtful = np.flatnonzero(~touched & (distance <= half * 3**0.5))

@@ -14,6 +14,7 @@ EXPERIMENTS = {
     "rays": Entry("benchmarks.lab.rays:run_rays", (0.05, 0.02, 0.01)),
     "readings": Entry("benchmarks.lab.readings:run_readings", (0.05, 0.02)),
     "cells": Entry("benchmarks.lab.cells:run_cells", (0.05, 0.02)),
+    "promise": Entry("benchmarks.lab.promise:run_promise", (0.05, 0.02)),
     "endless": Entry("benchmarks.lab.endless:run_endless", (0.1,)),
     "changes": Entry("benchmarks.lab.changes:run_changes", (0.05, 0.02), needs_data=False),
     "submaps": Entry("benchmarks.lab.submaps.corridor:run_submaps", (0.05,), needs_data=False),

@@ -40,7 +40,7 @@ LEAST_IN_BIN = 30
 _PLACES = 41
 """Points of a path at which the truth is looked up, 2.5 cm apart."""
 
-_ROOM = "synthetic:room?width=320&height=240&frames=16"
+_ROOM = "synthetic:room?width=320&height=240"
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ def _house(experiment: Experiment) -> _Place:
     return _Place(Scene(scene.name, scene.camera, scene.noise, scene.volume, scene.max_depth, views), mesh)
 
 
-def _room(experiment: Experiment) -> _Place:
+def _room(experiment: Experiment, frames: int = 16) -> _Place:
     """The built-in room with its own noise."""
-    dataset: Any = open_dataset(f"{_ROOM}&seed={experiment.seeds[0]}", color=False)
+    dataset: Any = open_dataset(f"{_ROOM}&frames={frames}&seed={experiment.seeds[0]}", color=False)
     views = []
     for index in range(len(dataset))[: experiment.limit]:
         frame, clean = dataset.read(index), dataset.clean_depth(index)

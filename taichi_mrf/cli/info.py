@@ -242,6 +242,8 @@ def print_map(console: Terminal, facts: Facts) -> None:
         half_life = facts["half_life_s"]
         table.add_row("world", f"may change, half-life {half_life:g} s" if half_life else "static")
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
+    if facts.get("free_space"):
+        table.add_row("free space", facts["free_space"])
     if "surface" in facts:
         held = [name for name in ("colors", "surface") if facts[name]]
         table.add_row("also holds", " and ".join(held) or "neither colors nor surface")
@@ -275,6 +277,7 @@ def _run_map(path: Path) -> Facts:
         "stamps_s": [min(stamps), max(stamps)] if stamps else None,
         "half_life_s": header.config.time.half_life_s,
         "inferred": header.settled,
+        "free_space": None if header.promise is None else header.promise.sentence(),
         "chunks_outside_window": parked,
         "configuration": _changed_parameters(header.config),
     }

@@ -21,7 +21,7 @@ rays all end in a voxel says nothing: that voxel is full, and the marginals' bus
 there has ends in most keyframes; one that moves, a flying pixel or a pose that is off has them in few, and
 the others outweigh these. What follows from a score is in thin_matter.py.
 
-In a world that may change, each keyframe that sees a voxel takes an eighth from its score first, so that what
+In a world that may change, each keyframe that sees a voxel takes a quarter from its score first, so that what
 has gone is forgotten.
 """
 
@@ -64,7 +64,7 @@ PASSED = 30
 BEFORE_SIGMAS = 3.0
 """A ray without a surface to vote for passes what lies so many sigmas before its measurement."""
 
-FADING = 3
+FADING = 2
 """A keyframe takes 1 / 2^FADING from the scores of what it sees, in a world that may change."""
 
 LASTING = ENDED << FADING

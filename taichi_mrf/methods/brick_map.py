@@ -40,10 +40,12 @@ from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology, create_topology, recycle
 
 if TYPE_CHECKING:
-    from taichi_mrf.queries import contradiction, extract, within
+    from taichi_mrf.queries import contradiction, extract, free, within
     from taichi_mrf.queries.measured_depth import MeasuredDepth
 else:
-    contradiction, extract, within = later("taichi_mrf.queries", "contradiction", "extract", "within")
+    contradiction, extract, free, within = later(
+        "taichi_mrf.queries", "contradiction", "extract", "free", "within"
+    )
 
 MapT = TypeVar("MapT", bound="BrickMap")
 SectionT = TypeVar("SectionT")
@@ -94,6 +96,10 @@ class BrickMap(Owned):
     """The entry of the map's method."""
 
     view: View = owned_attribute()
+
+    promise: "free.FreePromise | None" = None
+    """What levels of free space mean in this map, from frames that it has not seen
+    (evaluation.free_space.calibrate_free); ``taichi-mrf map`` finds it. None: by the default table."""
 
     _next_id: int
     """The id of the next keyframe: how many were added."""
@@ -294,6 +300,27 @@ class BrickMap(Owned):
         path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as
         :meth:`occupied_within`, and ConfigError for a path without points."""
         return within.path_collision(points, radius_m, *self._likely_grid())
+
+    @tensors.in_kind("points")
+    def free_with(self, points: ArrayLike, level: float = 0.99, radius_m: float = 0.0) -> NDArray[np.bool_]:
+        """Whether points (N, 3) in metres, or balls of ``radius_m`` around them, are free at a level: of the
+        voxels that are, at most 1 - ``level`` contain matter. (N,) bool. A ball is free if all voxels that it
+        reaches into are (queries.free).
+
+        The level's bound is that of :attr:`promise`. Raises ConfigError for a level that cannot be promised,
+        and in a map that is not :attr:`settled`: its probabilities are not those that were calibrated."""
+        return free.free_with(self, points, level, radius_m)
+
+    @tensors.in_kind("points")
+    def path_free_with(self, points: ArrayLike, radius_m: float, level: float = 0.99) -> NDArray[np.bool_]:
+        """Whether all voxels that a ball reaches into on a path (N, 3) -> (), or paths (P, N, 3) -> (P,), are
+        free at a level; the rest as :meth:`free_with`."""
+        return free.path_free_with(self, points, radius_m, level)
+
+    def box_free_with(self, lower: ArrayLike, upper: ArrayLike, level: float = 0.99) -> bool:
+        """Whether all voxels of an upright box between two corners, (3,) in metres, are free at a level; the
+        rest as :meth:`free_with`."""
+        return free.box_free_with(self, lower, upper, level)
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         return point_log_odds(points, *self._grid())

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +30,16 @@ from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
+from taichi_mrf.system.later import later
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.topology import SparseTopology
+
+if TYPE_CHECKING:
+    from taichi_mrf.queries import free
+    from taichi_mrf.queries.free import FreePromise
+else:
+    (free,) = later("taichi_mrf.queries", "free")
 
 FORMAT = 3
 """The newest format. Format 2 added the manifest, format 3 cameras that are no pinholes."""
@@ -88,7 +95,7 @@ class StoredKeyframe:
 class MapHeader:
     """Contents of the files of all methods; ``config.method`` names the method. ``settled`` says whether the
     voxels are those that a full inference of these keyframes gives; ``up`` is the world axis that is up, None
-    if it is unknown."""
+    if it is unknown; ``promise`` is what levels of free space mean, None if the map was not calibrated."""
 
     config: Config
     noise: NoiseModel
@@ -96,6 +103,7 @@ class MapHeader:
     next_id: int
     settled: bool = True
     up: Up | None = None
+    promise: "FreePromise | None" = None
 
     @property
     def up_axis(self) -> str:
@@ -127,6 +135,7 @@ class MapHeader:
             "settled": np.asarray(self.settled),
             "up": np.asarray(self.up_axis),
             **noise_arrays(self.noise),
+            **({} if self.promise is None else promise_arrays(self.promise)),
         }
         for number, keyframe in enumerate(keyframes):
             arrays[f"keyframe_depth_{number}"] = keyframe.depth_m
@@ -215,7 +224,8 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
     settled = file.scalar("settled", "b") if "settled" in file else True  # earlier versions did not save it
-    return MapHeader(config, noise, keyframes, next_id, settled, _up(path, file, keyframes))
+    up = _up(path, file, keyframes)
+    return MapHeader(config, noise, keyframes, next_id, settled, up, read_promise(file))
 
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -271,6 +281,24 @@ def read_noise(file: NpzFile, prefix: str = "") -> NoiseModel:
             return PatchNoise(sigma, bias, file.scalar(f"{prefix}patch", "iu"), camera)
         sigma, bias = (file.array(prefix + name, "f", (1, None))[0] for name in ("sigma", "bias"))
         return PolynomialNoise(sigma, bias)
+
+
+_PROMISE = ("levels", "bound", "held_least", "held_most", "lost_m")
+
+
+def promise_arrays(promise: "FreePromise") -> dict[str, NDArray[Any]]:
+    """What levels of free space mean, as arrays by name."""
+    arrays = {f"promise_{name}": getattr(promise, name) for name in _PROMISE}
+    return {**arrays, "promise_blocks": np.asarray(promise.blocks)}
+
+
+def read_promise(file: NpzFile) -> "FreePromise | None":
+    """What :func:`promise_arrays` has saved; None in files without it, as earlier versions wrote them."""
+    if "promise_levels" not in file:
+        return None
+    levels = file.array("promise_levels", "f", (None,))
+    others = {name: file.array(f"promise_{name}", "f", (len(levels),)) for name in _PROMISE[1:]}
+    return free.FreePromise(levels=levels, **others, blocks=file.scalar("promise_blocks", "iu"))
 
 
 def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:

@@ -23,6 +23,7 @@ from taichi_mrf.voxels.pool import BrickPool
 if TYPE_CHECKING:
     from taichi_mrf.inference.keyframe import Keyframe
     from taichi_mrf.methods.map_file import StoredKeyframe
+    from taichi_mrf.queries.free import FreePromise
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,9 @@ class OccupancyMap(VoxelMap, Protocol):
     def stale(self) -> bool:
         """True if the last removals and moves show only after :meth:`infer`."""
         ...
+
+    promise: "FreePromise | None"
+    """What levels of free space mean, from frames that the map has not seen (queries.free)."""
 
     @property
     def settled(self) -> bool:

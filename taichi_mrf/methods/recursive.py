@@ -271,7 +271,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         slots = self._pool.in_order
         keyframes = list(self._keyframes.values())
-        header = MapHeader(self.config, self.noise, keyframes, self._next_id, self.settled, self.up)
+        facts = (self._next_id, self.settled, self.up, self.promise)
+        header = MapHeader(self.config, self.noise, keyframes, *facts)
         belief = self._pool.read("belief", slots)
         write_recursive(Path(path), RecursiveContents(header, self._pool.bricks[slots], belief, self._stale))
 
@@ -289,6 +290,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         for k in header.keyframes:
             m._keyframes[k.id] = k
         m._next_id, m._stale, m._up = header.next_id, contents.stale, header.up
+        m.promise = header.promise
         m._newest_s = max((k.stamp_s for k in header.keyframes), default=-math.inf)
         return m
 

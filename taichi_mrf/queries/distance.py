@@ -30,6 +30,7 @@ from taichi_mrf.kernels.types import (
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.distance_bricks import DistanceBricks
 from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid, SpaceRules, UnknownSpace
+from taichi_mrf.queries.free import bound_now
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
@@ -212,21 +213,25 @@ class DistanceField(Owned):
         unknown: UnknownSpace = "free",
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
+        level: float | None = None,
     ) -> None:
         """Work out the distances of a map as it is now.
 
         ``unknown`` says what unknown voxels are: "free" space, "occupied", which makes them obstacles, or
         "unknown": no obstacles, and in them the distance is NaN. ``lower`` and ``upper``, (3,) in
         metres, bound the field to a box, outside of which all is NaN; obstacles around it count.
+        With a ``level``, free voxels that are not free at that level (``m.free_with``) are obstacles, so that
+        distances are lower bounds; with ``unknown="occupied"``, all that is not free at the level is.
 
-        Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, and
-        corners that make no box; CapacityError if there is not enough memory.
+        Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, corners
+        that make no box, and a level that the map cannot promise (then also :meth:`update`); CapacityError if
+        there is not enough memory.
         """
         if unknown not in ("free", "occupied", "unknown"):
             raise ConfigError(f"unknown must be free, occupied or unknown, not {unknown!r}")
         if (lower is None) != (upper is None):
             raise ConfigError("a distance field needs both corners of its box, lower and upper, or none")
-        self.map, self.unknown = m, unknown
+        self.map, self.unknown, self.level = m, unknown, level
         self.max_distance_m = real(max_distance_m, "max_distance_m", above=0)
         rules = SpaceRules.of(unknown, self.max_distance_m, m.voxel_size)
         self._bricks = DistanceBricks(rules)
@@ -262,7 +267,8 @@ class DistanceField(Owned):
         if not self._complete:
             self._bricks.start_over()
         self._complete = False
-        voxels = self._bricks.update(self.map, self._within)
+        most = None if self.level is None else bound_now(self.map, self.level)
+        voxels = self._bricks.update(self.map, self._within, most)
         self._complete = True
         return voxels
 

@@ -27,6 +27,7 @@ from taichi_mrf.queries.distance_grid import (
     keep_classes,
 )
 from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
+from taichi_mrf.queries.free import refused
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, seen_free_bricks
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime
@@ -73,10 +74,11 @@ class DistanceBricks:
         """Bytes of memory that distances and what they are made of take."""
         return self._capacity * _BYTES_PER_BRICK + 4 * self._codes.size
 
-    def update(self, m: VoxelMap, within: BrickBox | None = None) -> int:
+    def update(self, m: VoxelMap, within: BrickBox | None = None, most: float | None = None) -> int:
         """Take in the states of the map as they are now; returns how many voxels changed their distance.
 
-        ``within``: only bricks in this box count. Raises CapacityError.
+        ``within``: only bricks in this box count. ``most``: free voxels whose log-odds are not below it are
+        obstacles. Raises CapacityError.
         """
         m = m.decided
         bricks, sources = self._sources(m, within)
@@ -87,7 +89,8 @@ class DistanceBricks:
         view = m.view
         found, changed = ti.ndarray(ti.i32, len(cells) * COLUMNS), _zeros(len(cells))
         classify_bricks(
-            view.pool.belief, sources, cells.astype(np.int32), view.pool.prior_log_odds,
+            view.pool.belief if most is None else refused(m, most),
+            sources, cells.astype(np.int32), view.pool.prior_log_odds,
             view.volume.min_evidence, self.rules.unknown == "occupied", self.rules.unknown == "unknown",
             self.grid, found, changed,
         )  # fmt: skip

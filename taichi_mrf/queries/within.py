@@ -137,14 +137,14 @@ def path_collision(
         raise ConfigError(f"a path needs points of shape (N, 3) or (P, N, 3), not {given.shape}")
     paths = checked_points(given.reshape(-1, 3)).reshape(-1, *given.shape[-2:])
     step = _PLACES_APART * real(radius_m, "radius_m", above=0)
-    places, path_of = _places(paths, step)
+    places, path_of = path_places(paths, step)
     there = occupied_within(places, radius_m, voxel_size, topology, pool, seen_free)
     likeliest = np.zeros(len(paths), np.float32)
     np.maximum.at(likeliest, path_of, there)
     return likeliest.reshape(given.shape[:-2])
 
 
-def _places(paths: NDArray[np.float64], step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def path_places(paths: NDArray[np.float64], step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points (M, 3) at most ``step`` metres apart along paths (P, N, 3), and the path of each, (M,)."""
     starts, ways = paths[:, :-1].reshape(-1, 3), np.diff(paths, axis=1).reshape(-1, 3)
     parts = np.maximum(np.ceil(np.linalg.norm(ways, axis=1) / step), 1).astype(np.int64)

@@ -16,6 +16,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
+from taichi_mrf.evaluation.free_space import calibrate_free, spread_frames
 from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out
 from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise, enough_of
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
@@ -134,11 +135,13 @@ def write_run(
 
     Returns the report and the paths. Raises MapFileError.
     """
-    written, occupied = _write_map(folder, result, facts.config, advance)
-    chunked = in_chunks(result.map)
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
+    if check and posed is not None and not haste.hurried:
+        _calibrate(result, posed, advance)
+    written, occupied = _write_map(folder, result, facts.config, advance)
+    chunked = in_chunks(result.map)
     found, noise = None, None
     if check and posed is not None:
         render = None if chunked is None else partial(render_chunked, chunked)
@@ -254,6 +257,17 @@ def _check(
         return None
     result.skipped.update(check.skipped)
     return check
+
+
+def _calibrate(result: MappingResult, dataset: Dataset, advance: Advance) -> None:
+    """Find what levels of free space mean in the finished map, before it is written."""
+    m = result.map
+    if not m.settled or result.interrupted or window_of(m) is not None or not result.held_out:
+        return
+    advance("Free space", 0, 1)
+    with result.timed("checking"):
+        m.promise = calibrate_free(m, _readable(dataset, spread_frames(result.held_out)))
+    advance("Free space", 1, 1)
 
 
 def _check_noise(

@@ -49,6 +49,7 @@ def run_report(
         "residual": result.residual,
         "seconds": rounded(result.seconds),
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
+        "free_space": None if result.map.promise is None else result.map.promise.to_json(),
         "noise": None,
         "tracking": None if result.track is None else _tracking(result.track, result.loops_closed),
         "followed": None if result.followed is None else dataclasses.asdict(result.followed),

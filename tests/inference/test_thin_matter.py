@@ -127,7 +127,7 @@ def test_order_freezing_and_a_file_keep_the_post(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("backwards", [False, True])
 def test_in_a_world_that_may_change_a_post_is_found_and_then_forgotten(backwards: bool) -> None:
-    """Thirty views with it, the others without: what they say fades by an eighth with each."""
+    """Thirty views with it, the others without: what they say fades by a quarter with each."""
     there = np.arange(60) < 30
     stamps = np.arange(60)[::-1] if backwards else np.arange(60)
     m = MRFMap(VOXEL, NOISE, time=TimeConfig(half_life_s=LIVE_HALF_LIFE_S))

@@ -487,5 +487,5 @@ class MRFMap(BrickMap):
             if m.window is not None:
                 m.window.resume(Path(path), contents.parked)
         storage.show_contents(contents, m._parts, slots)
-        m._next_id, m._up = header.next_id, header.up
+        m._next_id, m._up, m.promise = header.next_id, header.up, header.promise
         return m

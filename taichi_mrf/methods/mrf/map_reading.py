@@ -63,6 +63,7 @@ class MapReading(BrickMap):
         self._source, self._parts, self._rays = source, parts, rays
         self._registry, self._version, self._up = parts.registry, parts.registry.version, source.up
         self.seen_free_log_odds = source.seen_free_log_odds
+        self.promise = source.promise
         self._pool = parts.pool.with_beliefs(belief)
         shown = source.view
         self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)

@@ -67,7 +67,7 @@ class MapContents:
 def save(m: OccupancyMap, parts: MapParts, next_id: int, path: Path, window: MovingWindow | None) -> None:
     """MRFMap.save; ``window`` is the map's, if it has one."""
     stored = [StoredKeyframe.of(keyframe) for keyframe in parts.keyframes.values()]
-    header = MapHeader(m.config, m.noise, stored, next_id, parts.settled, m.up)
+    header = MapHeader(m.config, m.noise, stored, next_id, parts.settled, m.up, m.promise)
     parked = [] if window is None else window.save_beside(path, m)
     write_contents(path, contents_of(header, parts, parked))
     if window is not None:
