@@ -64,8 +64,9 @@ PASSED = 30
 BEFORE_SIGMAS = 3.0
 """A ray without a surface to vote for passes what lies so many sigmas before its measurement."""
 
-FADING = 2
-"""A keyframe takes 1 / 2^FADING from the scores of what it sees, in a world that may change."""
+FADING, FREE_FADING = 2, 4
+"""A keyframe takes 1 / 2^FADING from the scores of what it sees, in a world that may change, and less from
+those below 0: one end in space that was free for long is noise."""
 
 LASTING = ENDED << FADING
 """The largest score that fading leaves."""
@@ -227,7 +228,7 @@ def _tally(
                 votes[VOTES * voxel] += FOR * won - AGAINST * against
                 score = votes[VOTES * voxel + 1]
                 if changing == 1:
-                    score -= score >> FADING
+                    score -= score >> (FADING if score > 0 else FREE_FADING)
                 if ended == 0:
                     score -= ti.min(passed, PASSED)
                 elif passed > 0:

@@ -1,11 +1,12 @@
 """Voxels that are partly full: where rays end that most others pass, by the scores of surface_votes.py.
 
-A voxel with a score above 0 holds matter, and so does an occupied one. It is not called free. It is called
-occupied only where the matter is thin, or stands alone: around a larger thing the voxels that its surface
-cuts, and those that noise reaches, have ends as well, and walls would grow by a voxel. The first voxels are
-those with a score of MATTER whose surroundings within ALONE_WITHIN voxels hold few that the marginals call
-occupied, and those on a rod: in a row of layers across an axis, the matter in a square around the voxel is
-no more than a thing of THIN_M fills. From there the thing is followed for two voxels, into what it stands on.
+A voxel with a score above 0 holds matter, and so does an occupied one. It is not called free; around a
+larger thing, whose noise reaches further than its surface, only from a score of BESIDE on. It is called
+occupied only where the matter is thin, or stands alone: the voxels that a larger surface cuts have ends as
+well, and walls would grow by a voxel. The first voxels are those with a score of MATTER whose surroundings
+within ALONE_WITHIN voxels hold few that the marginals call occupied, and those on a rod: in a row of layers
+across an axis, the matter in a square around the voxel is no more than a thing of THIN_M fills. From there
+the thing is followed for two voxels, into what it stands on.
 """
 
 import math
@@ -26,6 +27,9 @@ from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, rows_around
 
 TWENTIETHS = 2
 """Twentieths of a nat, the unit of scores, in a tenth, that of MATTER."""
+
+BESIDE = 60
+"""Score, in tenths of a nat, from which on a voxel is not called free beside a larger thing."""
 
 ALONE, ALONE_WITHIN = 3, 3
 """Occupied voxels at most, within so many voxels, around a thing that stands alone."""
@@ -118,10 +122,12 @@ class _Voxels(Bundle):
         return yes
 
     @ti.func
-    def may_be_matter(self, voxel: I32):
-        """1 for a voxel that is not occupied, whose score suffices."""
-        enough = self.votes[VOTES * voxel + 1] // TWENTIETHS >= MATTER
-        return ti.cast(enough and self.log_odds[voxel] <= self.occupied, ti.i32)
+    def tenths(self, voxel: I32):
+        """The score of a voxel, in tenths of a nat, -1 for an occupied one."""
+        score = self.votes[VOTES * voxel + 1] // TWENTIETHS
+        if self.log_odds[voxel] > self.occupied:
+            score = -1
+        return score
 
     @ti.func
     def occupied_near(self, place: I32, cell: IVec3, within: I32, limit: I32):
@@ -192,13 +198,14 @@ def _find_first(slots: I32Array, voxels: _Voxels, verdicts: I32Array) -> None:
     the ones of thin things and of things that stand alone."""
     for i in range(slots.shape[0] * VOXELS):
         place, voxel = i // VOXELS, slots[i // VOXELS] * VOXELS + i % VOXELS
-        if voxels.votes[VOTES * voxel + 1] > 0 and voxels.log_odds[voxel] <= voxels.occupied:
-            verdicts[voxel] = _DOUBTED
-            if voxels.may_be_matter(voxel) == 1:
-                cell = cell_of(i % VOXELS)
-                first = voxels.occupied_near(place, cell, ALONE_WITHIN, ALONE) <= ALONE
-                if first or voxels.is_on_a_rod(place, cell) == 1:
-                    verdicts[voxel] = _MATTER
+        score = voxels.tenths(voxel)
+        if score >= 0 and voxels.votes[VOTES * voxel + 1] > 0:
+            cell = cell_of(i % VOXELS)
+            alone = voxels.occupied_near(place, cell, ALONE_WITHIN, ALONE) <= ALONE
+            if alone or score >= BESIDE:
+                verdicts[voxel] = _DOUBTED
+            if score >= MATTER and (alone or voxels.is_on_a_rod(place, cell) == 1):
+                verdicts[voxel] = _MATTER
 
 
 @kernel
@@ -206,7 +213,7 @@ def _follow(slots: I32Array, voxels: _Voxels, last: I32, verdicts: I32Array) -> 
     """Add voxels that touch those of a verdict up to ``last`` to the ``verdicts`` (pool * 512)."""
     for i in range(slots.shape[0] * VOXELS):
         place, voxel = i // VOXELS, slots[i // VOXELS] * VOXELS + i % VOXELS
-        if verdicts[voxel] == _DOUBTED and voxels.may_be_matter(voxel) == 1:
+        if verdicts[voxel] < _MATTER and voxels.tenths(voxel) >= MATTER:
             cell, touches = cell_of(i % VOXELS), 0
             for k in range(27):
                 other = voxel_around(voxels.around, place, cell + IVec3(k // 9, k // 3 % 3, k % 3) - 1)

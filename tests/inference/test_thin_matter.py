@@ -204,7 +204,8 @@ def verdicts_by_numpy(
     found = enough & (rods | (number(occupied, 3, 3, 3) <= 3))
     for _ in range(2):
         found |= enough & (number(found, 1, 1, 1) > 0) & (number(occupied, 1, 1, 1) <= 3)
-    return np.where(found, 2, (score > 0) & ~occupied).astype(np.int8)
+    doubted = (score > 0) & ~occupied & ((number(occupied, 3, 3, 3) <= 3) | (score // 2 >= 60))
+    return np.where(found, 2, doubted).astype(np.int8)
 
 
 @pytest.mark.compilers
@@ -217,6 +218,7 @@ def test_what_scores_decide_is_what_numpy_finds(voxel_size: float) -> None:
     occupied, score = np.zeros((side,) * 3, bool), np.full((side,) * 3, -9, np.int64)
     occupied[:, :, 2] = True
     score[:, :, 3][draw.random((side, side)) < 0.5] = 60
+    score[:, :, 4][draw.random((side, side)) < 0.2] = 130
     occupied[4:9, 4:9, 12:15] = True
     for x, y, width in ((15, 4, 1), (15, 18, 2), (5, 17, 4)):
         score[x : x + width, y : y + width, 3:22] = draw.integers(30, 90, (width, width, 19))
