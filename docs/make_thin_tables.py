@@ -17,6 +17,10 @@ KINDS = ["room", "voxels", "thing", *(f"{name}: occupied (free)" for name in MET
 PATHS = ["hit through", "hit past"]
 MAPS = ["room", "voxels", "map", "precision", "too early"]
 WALL = "wall"
+SHOWN = {
+    ("room, camera", "5 cm"), ("room, camera", "2 cm"), ("fence, camera", "5 cm"),
+    ("clutter, camera", "5 cm"), ("room, lidar", "5 cm"), ("fence, lidar", "5 cm"), ("yard, lidar", "5 cm"),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -26,6 +30,8 @@ def main() -> None:
     maps: Rows = {}
     for result in results:
         where = (f"{result['room']}, {result['sensor']}", f"{100 * result['voxel_size']:g} cm")
+        if where not in SHOWN:
+            continue
         maps[(*where, METHODS[result["method"]])] = [f"{result['precision']:.3f}", f"{result['blocked']:.3f}"]
         for kind, found in result["kinds"].items():
             if kind != WALL and found["voxels"]:

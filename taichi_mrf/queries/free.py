@@ -86,8 +86,9 @@ class FreePromise:
         if self.bound[i] <= NEVER:
             return f"free space cannot be promised at {level:.0%}: held-out frames saw too little of it"
         low, high = (_percent(values[i]) for values in (self.held_least, self.held_most))
+        held = low if low == high else f"{low} to {high}"
         return (
-            f"free space is promised at {level:.0%}: {low} to {high}% held on {self.blocks} frames that the "
+            f"free space is promised at {level:.0%}: {held}% held on {self.blocks} frames that the "
             f"map has not seen, {100 * self.lost_m[i]:.1f} cm of clearance lost"
         )
 

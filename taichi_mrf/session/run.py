@@ -96,6 +96,7 @@ class Progress:
             replay.finished if replay else True,
             waiting or mapper.edited,
             replay.speed if replay and replay.has_pace else None,
+            mapper.map.promise.sentence() if mapper.map.promise and mapper.map.settled else "",
         )
 
     def time_left(self, replay: Replay) -> str:

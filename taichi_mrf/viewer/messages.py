@@ -179,7 +179,8 @@ class CurrentCamera(Update):
 class Status(Update):
     """Progress and figures. ``activity`` says what is being done, ``share`` how much of it is done (0 to 1),
     ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
-    pace (0: as fast as possible), None where frames have none."""
+    pace (0: as fast as possible), None where frames have none. ``free_space`` says how sure free space is, if
+    frames were held out for that."""
 
     activity: str
     share: float
@@ -195,6 +196,7 @@ class Status(Update):
     finished: bool
     pending: bool
     speed: float | None = None
+    free_space: str = ""
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,16 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
         assert (speed.value if speed.visible else None) == name
 
 
+def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
+    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
+    numbers = handled.page.panel._numbers
+    handled.take(status)
+    assert "free space" not in numbers.content
+    handled.take(replace(status, free_space="free space is promised at 99%: 98.9 to 99.3% held"))
+    assert "free space" in numbers.content
+    assert "promised at 99%: 98.9 to 99.3% held" in numbers.content
+
+
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
     looks = handled.page.panel.view_options.handles["look"]
     assert "voxels by keyframes" in looks.options
