@@ -108,7 +108,8 @@ class MapParts:
         sweeper = Sweeper(config.voxel_size, config.sensor, inference, volume, limits)
         note_sweep = None if beliefs is None else beliefs.note_sweep
         renewing = (bounds, allocator.look_again, allocator.refresh, inference.renew_tolerance, note_sweep)
-        kept = KeptRays(config.keep_surface)
+        kept, colors = KeptRays(config.keep_surface), MapColors(registry, keyframes, sweeper, allocator.refresh)
+        registry.on_release = colors.forget
         return MapParts(
             config=config,
             prior=prior,
@@ -119,7 +120,7 @@ class MapParts:
             sweeper=sweeper,
             incremental=IncrementalInference(pool, sweeper, *renewing),
             surfels=KeyframeSurfels(config.voxel_size, config.sensor.max_depth),
-            colors=MapColors(registry, keyframes, sweeper, allocator.refresh),
+            colors=colors,
             kept=kept,
             decisions=Decisions(registry, keyframes, kept, sweeper),
             keyframes=keyframes,

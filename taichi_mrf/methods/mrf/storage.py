@@ -93,7 +93,7 @@ def contents_of(header: MapHeader, parts: MapParts, parked: list[str]) -> MapCon
         parts.frozen,
         parked,
         parts.colors.stored(slots, header.settled),
-        parts.colors.left(),
+        parts.colors.frozen,
         parts.kept.share,
     )
 
