@@ -108,7 +108,8 @@ class MapParts:
         sweeper = Sweeper(config.voxel_size, config.sensor, inference, volume, limits)
         note_sweep = None if beliefs is None else beliefs.note_sweep
         renewing = (bounds, allocator.look_again, allocator.refresh, inference.renew_tolerance, note_sweep)
-        kept, colors = KeptRays(config.keep_surface), MapColors(registry, keyframes, sweeper, allocator.refresh)
+        kept = KeptRays(config.keep_surface)
+        colors = MapColors(registry, keyframes, sweeper, allocator.refresh)
         registry.on_release = colors.forget
         return MapParts(
             config=config,
