@@ -79,15 +79,18 @@ class FullInference(Settling[InferProgress, InferReport | None]):
         meanwhile and to go back to it if inference is stopped early or fails. Maps without messages cannot
         go back."""
         self._map = m
-        self._checkpoint = m.checkpoint() if keep_before and has_messages(m) else None
-        self._before = m.view.pool.snapshot() if keep_before and self._checkpoint is None else None
+        self._with_messages = m if has_messages(m) else None
+        kept = self._with_messages if keep_before else None
+        self._checkpoint = None if kept is None else kept.checkpoint()
+        self._before = m.view.pool.snapshot() if keep_before and kept is None else None
         super().__init__(self._inferring(sweeps))
 
     def showing_before(self) -> AbstractContextManager[None]:
-        """While the block runs, queries and files show the map as it was before, with ``keep_before``."""
-        before = self._before if self._checkpoint is None else self._checkpoint.pool
-        assert before is not None, "no copy was kept"
-        return self._map.view.pool.showing(before)
+        """While the block runs, all queries and files show the map as it was before, with ``keep_before``."""
+        if self._with_messages is not None and self._checkpoint is not None:
+            return self._with_messages.showing(self._checkpoint)
+        assert self._before is not None, "no copy was kept"
+        return self._map.view.pool.showing(self._before)
 
     def _inferring(self, sweeps: int | None) -> Generator[InferProgress, None, InferReport | None]:
         steps = self._map.infer_steps(sweeps=sweeps)
@@ -110,5 +113,5 @@ class FullInference(Settling[InferProgress, InferReport | None]):
             return report if stays else None
         finally:
             steps.close()
-            if not stays and self._checkpoint is not None and has_messages(self._map):
-                self._map.restore(self._checkpoint)
+            if not stays and self._checkpoint is not None and self._with_messages is not None:
+                self._with_messages.restore(self._checkpoint)

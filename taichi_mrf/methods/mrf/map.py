@@ -5,6 +5,7 @@ parts (parts.py), and of functions that work on them, whose modules are loaded w
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -294,6 +295,12 @@ class MRFMap(BrickMap):
     def restore(self, checkpoint: inferring.Checkpoint) -> None:
         """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
         inferring.go_back(self._parts, checkpoint)
+
+    def showing(self, checkpoint: inferring.Checkpoint) -> AbstractContextManager[None]:
+        """While the block runs, all queries and files are those of the map at a checkpoint, as it was at
+        rest: its states, ray casts, layers, surface and colours. The block must not change the map. Since the
+        checkpoint only :meth:`infer_steps` may have been begun."""
+        return inferring.showing(self._parts, checkpoint)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> "depth_graph.FactorGraph":
         """The factor graph without average messages, for factor_graph.solve: a factor for the ray of every
