@@ -324,6 +324,7 @@ class MRFMap(BrickMap):
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
         """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
         frozen ones count as one; 255 means 255 or more."""
+        inferring.restore_messages(self._parts)
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, sent, self._pool)
 
