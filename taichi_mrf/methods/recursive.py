@@ -176,8 +176,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         elif missing is not None and self.sensor.no_return != "ignore":
             warnings.warn(
                 f"sensor.no_return: {self.sensor.no_return} has no effect: a map of the method "
-                f"{self.METHOD.name} takes no notice of {int(missing.sum())} pixels without a return. Set it to "
-                "ignore, or map with mrf (free, model) or log_odds (free)",
+                f"{self.METHOD.name} takes no notice of {int(missing.sum())} pixels without a return. "
+                "Set it to ignore, or map with mrf (free, model) or log_odds (free)",
                 stacklevel=2,
             )
         if not self._keyframes:

@@ -97,8 +97,15 @@ def freeze_keyframe(parts: MapParts, id: int) -> None:
     parts.surfels.freeze(keyframe)
     parts.decisions.frozen(id)
     parts.frozen[id] = keyframe.name
+    drop(parts, id)
+
+
+def drop(parts: MapParts, id: int) -> None:
+    """Forget a keyframe that was taken out or frozen. Frozen ones may have waited for it."""
     del parts.keyframes[id]
     parts.settled = False
+    if parts.dated is not None:
+        parts.dated.fold_for_good()
 
 
 def show(parts: MapParts, slots: NDArray[np.int32], log_odds: NDArray[np.float32]) -> None:

@@ -174,8 +174,7 @@ class MRFMap(BrickMap):
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
-        del self._keyframes[id]
-        self._parts.settled = False
+        inferring.drop(self._parts, id)
 
     def move_keyframe(
         self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None

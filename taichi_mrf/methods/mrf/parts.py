@@ -174,14 +174,14 @@ class MapParts:
 
     def statistics(self) -> MapStatistics:
         """The size of the map."""
-        keyframes = self.keyframes.values()
+        keyframes, waiting = self.keyframes.values(), 0 if self.dated is None else self.dated.waiting_bytes
         images = sum(k.image_bytes for k in keyframes)
         return measure(
             self.pool,
             keyframes=len(keyframes),
             frozen=len(self.frozen),
             rays=sum(k.rays for k in keyframes),
-            message_bytes=sum(k.voxel_bytes for k in keyframes),
+            message_bytes=sum(k.voxel_bytes for k in keyframes) + waiting,
             other_bytes=images + self.sweeper.nbytes + self.found_bytes,
         )
 
