@@ -10,6 +10,11 @@ was free then, and l the chance that what is free now was occupied then. The nex
 to that. Time acts on the sum so far and not on each message, so 30 old views do not outvote 3 new ones: the
 sum of any number of them is worth no more than -log l for occupied and log a for free.
 
+What frozen keyframes say is folded for good, which has one order, too. So a keyframe that is frozen before an
+older one leaves its messages, and they wait until no older one is to come. A keyframe that is added after
+newer ones were folded for good is late: the late ones of a brick are folded by themselves, pass through time
+up to what is there, and are added to it.
+
 Messages themselves do not depend on time: their cavities (eq. 6) come from all other keyframes.
 
 What a single view sees in a place that was surely free cannot outweigh the past at once. So that someone who
@@ -18,7 +23,9 @@ another view sees the voxel, or a few seconds are over.
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import groupby
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +35,7 @@ from taichi_mrf.inference.dated_channels import (
     NEVER,
     Aging,
     Channels,
+    add_bricks,
     age_bricks,
     clear_counts,
     copy_bricks,
@@ -35,7 +43,7 @@ from taichi_mrf.inference.dated_channels import (
     fold_bricks,
     grown_channels,
 )
-from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
@@ -54,6 +62,23 @@ FEW_MOVED = 7
 0.01. With 0 a keyframe costs 5% more, and beliefs are 0.0003 nearer to those of full inference."""
 
 
+@dataclass
+class Waiting:
+    """The messages of a frozen keyframe that wait for older ones. ``content`` is its key among those of one
+    stamp; ``left`` (n,) tells for which of its ``visible`` bricks."""
+
+    stamp_s: float
+    content: bytes
+    visible: VisibleBricks
+    messages: "ti.Ndarray"
+    left: NDArray[np.bool_]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the messages, which have two or four each."""
+        return len(self.left) * VOXELS * (2 if self.messages.dtype == ti.f16 else 4)
+
+
 class DatedBelief:
     """The beliefs that queries of a dated map read. They follow the messages when they are next read."""
 
@@ -66,6 +91,12 @@ class DatedBelief:
         self._outdated = np.zeros(len(self._channels.stamp_s), bool)
         self._folded: set[int] = set()  # keyframes whose messages are in the beliefs, or are outdated there
         self.frozen: Channels | None = None
+        self._waiting: list[Waiting] = []
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes of the messages of frozen keyframes that wait for older ones."""
+        return sum(each.nbytes for each in self._waiting)
 
     @property
     def bytes_per_voxel(self) -> int:
@@ -75,7 +106,7 @@ class DatedBelief:
     @property
     def now_s(self) -> float:
         """The newest keyframe's stamp, in seconds; NEVER if there is none."""
-        stamps = [keyframe.stamp_s for keyframe in self._keyframes()]
+        stamps = [each.stamp_s for each in self._sources()]
         if self.frozen is not None:
             stamps.append(float(self.frozen.stamp_s.max()))
         return max(stamps, default=NEVER)
@@ -107,7 +138,8 @@ class DatedBelief:
         without one."""
         if self.frozen is None:
             return float("-inf")
-        return float(self.frozen.stamp_s[self.pool.in_use].max(initial=-np.inf))
+        folded = float(self.frozen.stamp_s[self.pool.in_use].max(initial=-np.inf))
+        return max(folded, *(each.stamp_s for each in self._waiting), folded)
 
     def outdate(self) -> None:
         """All messages may have changed."""
@@ -133,11 +165,35 @@ class DatedBelief:
         self._fold(channels, keyframe, np.flatnonzero(newest))
 
     def freeze(self, keyframe: Keyframe) -> None:
-        """Add a keyframe's messages to what is known for good, as of its stamp."""
+        """Keep a keyframe's messages for :meth:`fold_for_good`, which is to be called once it is gone."""
         if self.frozen is None:
             self.frozen = Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
-        self._fold(self.frozen, keyframe, np.arange(len(keyframe.visible.slots)))
+        visible, messages = keyframe.visible, keyframe.messages
+        left = np.ones(len(visible.slots), bool)
+        self._waiting.append(Waiting(keyframe.stamp_s, content_key(keyframe), visible, messages, left))
         self.withdraw(keyframe)
+
+    def fold_for_good(self, slots: NDArray[np.int32] | None = None) -> None:
+        """Fold the messages of frozen keyframes for which no older one is to come; in some bricks, (n,)
+        slots, of all that wait."""
+        if not self._waiting or self.frozen is None:
+            return
+        ready = self._waiting
+        if slots is None:
+            oldest_s = min((keyframe.stamp_s for keyframe in self._keyframes()), default=np.inf)
+            if min(each.stamp_s for each in self._waiting) > oldest_s:
+                return
+            ready = []
+            for each in in_time(self._sources()):
+                if not isinstance(each, Waiting):
+                    break
+                ready.append(each)
+        wanted = np.full(self.pool.capacity, slots is None)
+        wanted[[] if slots is None else slots] = True
+        self._fold_in_time(self.frozen, ready, wanted)
+        for each in ready:
+            each.left &= ~wanted[each.visible.slots] & self._same(each)
+        self._waiting = [each for each in self._waiting if each.left.any()]
 
     def show(self, slots: NDArray[np.int32], belief: NDArray[np.float32], stamp_s: float) -> None:
         """Read these log-odds, (n) -> (n, 512), as of a time until messages change."""
@@ -160,13 +216,25 @@ class DatedBelief:
         self._outdated[slots] = True
 
     def read_frozen(self, slots: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-        """Beliefs of frozen keyframes in some bricks and their stamps, to save them; None without any."""
+        """Beliefs of frozen keyframes in some bricks and their stamps, to save them; None without any. Those
+        that wait are not in them."""
         if self.frozen is None:
             return None
         out = np.zeros(len(slots) * VOXELS, np.float32)
         if len(slots):
             read_bricks(self.frozen.now, slots, out, strip_length())
         return out.reshape(-1, VOXELS), self.frozen.stamp_s[slots]
+
+    def waiting(self) -> list[Waiting]:
+        """The messages of frozen keyframes that wait for older ones, to save them, in the order of stamps."""
+        return in_time(self._waiting)
+
+    def wait(self, stamp_s: float, content: bytes, slots: NDArray[np.int32], messages: NDArray) -> None:
+        """Restore messages (n, 512) that :meth:`waiting` had for the bricks in ``slots`` (n)."""
+        on_device = ti.ndarray(ti.f16 if messages.dtype == np.float16 else ti.f32, messages.size)
+        on_device.from_numpy(np.ascontiguousarray(messages).reshape(-1))
+        visible = VisibleBricks(np.zeros(0, np.int32), slots, self.pool.identity[slots], -1)
+        self._waiting.append(Waiting(stamp_s, content, visible, on_device, np.ones(len(slots), bool)))
 
     def start(self, slots: NDArray[np.int32]) -> None:
         """New bricks, (n) slots: their voxels are at the prior."""
@@ -200,13 +268,43 @@ class DatedBelief:
             copy_bricks(known, self.frozen.shown, channels.shown, strip_length())
             copy_counts(known, self.frozen.glimpsed, channels.glimpsed)
             channels.stamp_s[known] = self.frozen.stamp_s[known]
-        chosen = [k for k in self._keyframes() if k.messages is not None and k.stamp_s <= until_s]
-        for keyframe in in_time(chosen):
-            visible = keyframe.visible
-            same = self.pool.identity[visible.slots] == visible.identity
-            self._fold(channels, keyframe, np.flatnonzero(wanted[visible.slots] & same))
+        chosen = [k for k in self._sources() if k.messages is not None and k.stamp_s <= until_s]
+        self._fold_in_time(channels, chosen, wanted)
 
-    def _fold(self, channels: Channels, keyframe: Keyframe, places: NDArray[np.intp]) -> None:
+    def _sources(self) -> "list[Keyframe | Waiting]":
+        """All whose messages are not folded for good."""
+        sources: list[Keyframe | Waiting] = list(self._keyframes())
+        return sources + self._waiting
+
+    def _fold_in_time(
+        self, channels: Channels, sources: Iterable["Keyframe | Waiting"], wanted: NDArray[np.bool_]
+    ) -> None:
+        """Add messages to the bricks that are ``wanted`` (capacity), in the order of their stamps; those that
+        come too late for it by themselves."""
+        older: Channels | None = None
+        in_place: list[tuple[Keyframe | Waiting, NDArray[np.intp]]] = []
+        for source in in_time(sources):
+            places = np.flatnonzero(wanted[source.visible.slots] & self._same(source))
+            late = channels.stamp_s[source.visible.slots[places]] > source.stamp_s
+            in_place.append((source, places[~late]))
+            if late.any():
+                older = older or Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
+                self._fold(older, source, places[late])
+        if older is not None:
+            slots = np.flatnonzero(np.isfinite(older.stamp_s)).astype(np.int32)
+            self._age(older, slots, channels.stamp_s[slots])
+            add_bricks(
+                slots, older.now, channels.now, channels.shown, self.pool.prior_log_odds, strip_length()
+            )
+        for source, places in in_place:
+            self._fold(channels, source, places)
+
+    def _same(self, source: "Keyframe | Waiting") -> NDArray[np.bool_]:
+        """Which visible bricks are still those that the messages are for, (n,)."""
+        same: NDArray[np.bool_] = self.pool.identity[source.visible.slots] == source.visible.identity
+        return same & source.left if isinstance(source, Waiting) else same
+
+    def _fold(self, channels: Channels, keyframe: "Keyframe | Waiting", places: NDArray[np.intp]) -> None:
         """Let time pass up to a keyframe's stamp in some of its bricks, and add its messages to them."""
         if len(places) == 0:
             return
@@ -256,11 +354,18 @@ class DatedBelief:
         return Aging(*(part.astype(np.float32) for part in parts))
 
 
-def in_time(keyframes: Iterable[Keyframe]) -> list[Keyframe]:
+SourceT = TypeVar("SourceT", bound="Keyframe | Waiting")
+
+
+def in_time(keyframes: Iterable[SourceT]) -> list[SourceT]:
     """Keyframes by their stamps; those of one stamp by their content, so that the order does not depend on
     how they were added."""
-    ordered: list[Keyframe] = []
+    ordered: list[SourceT] = []
     for _, group in groupby(sorted(keyframes, key=lambda k: k.stamp_s), key=lambda k: k.stamp_s):
         same = list(group)
-        ordered += sorted(same, key=content_key) if len(same) > 1 else same
+        ordered += sorted(same, key=_content) if len(same) > 1 else same
     return ordered
+
+
+def _content(source: "Keyframe | Waiting") -> bytes:
+    return source.content if isinstance(source, Waiting) else content_key(source)

@@ -139,6 +139,19 @@ def age_bricks(
 
 
 @ti.kernel
+def add_bricks(slots: I32Array, older: F32Array, now: F32Array, shown: F32Array, prior: F32, strip: Template):
+    """Add the evidence of one channel (capacity * 512), log-odds over the prior, to bricks (n)."""
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        _, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            evidence = older[j + k] - prior
+            if evidence != 0.0:
+                glimpse = shown[j + k] - now[j + k]
+                now[j + k] += evidence
+                shown[j + k] = now[j + k] + glimpse
+
+
+@ti.kernel
 def copy_bricks(slots: I32Array, source: F32Array, target: F32Array, strip: Template):
     """Copy the bricks in ``slots`` (n) of one channel (capacity * 512) to another."""
     for part in range(slots.shape[0] * (VOXELS // strip)):

@@ -54,12 +54,13 @@ class KeyframeSelector:
 def surplus(m: MRFMap, newest: int, keep: int) -> list[int]:
     """The keyframes (ids) beyond ``keep`` to freeze, so that an endless run is bounded in time and memory.
 
-    Those that share the smallest part of what they see with keyframe ``newest`` come first, because they
-    will not change soon; of equal ones the oldest. Never ``newest``.
+    First those that share least of what they see with keyframe ``newest``, because they will not change soon;
+    of equal ones the oldest. If evidence has a date, the oldest: others would wait. Never ``newest``.
     """
     others = [k for id, k in m.keyframes.items() if id != newest and k.messages is not None]
     number = max(0, len(m.keyframes) - max(1, keep))
     in_view = np.zeros(m.view.pool.capacity, bool)
-    in_view[m.keyframes[newest].visible.slots] = True
+    if m.view.pool.dated is None:
+        in_view[m.keyframes[newest].visible.slots] = True
     shared = {k.id: float(in_view[k.visible.slots].mean()) if len(k.visible.slots) else 0.0 for k in others}
-    return sorted(shared, key=lambda id: (shared[id], id))[:number]
+    return sorted(shared, key=lambda id: (shared[id], m.keyframes[id].stamp_s, id))[:number]

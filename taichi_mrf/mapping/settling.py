@@ -42,8 +42,7 @@ class Settling(Generic[StepT, OutcomeT]):
         """Outcome of the work, once there are no more steps."""
 
     def stop(self, at_once: bool = False) -> None:
-        """Stop after the step that was taken last. More steps follow only to leave a whole map; none do if it
-        has to be ``at_once``."""
+        """Stop after the step taken last. More follow only to leave a whole map, and none if ``at_once``."""
         self._stop = StopRequestedError(at_once)
 
     def run(self) -> OutcomeT:
@@ -75,19 +74,19 @@ class FullInference(Settling[InferProgress, InferReport | None]):
     """Full inference over all keyframes of a map. The outcome is None if the map went back to what it was."""
 
     def __init__(self, m: OccupancyMap, sweeps: int | None = None, keep_before: bool = False) -> None:
-        """``sweeps`` overrides the configuration's. ``keep_before``: keep a copy of the map, to show it
-        meanwhile and to go back to it if inference is stopped early or fails. Maps without messages cannot
-        go back."""
+        """``sweeps`` overrides the configuration's. ``keep_before``: keep a copy of the map to show
+        meanwhile, and, if it has messages, to go back to if inference is stopped early or fails."""
         self._map = m
-        self._checkpoint = m.checkpoint() if keep_before and has_messages(m) else None
-        self._before = m.view.pool.snapshot() if keep_before and self._checkpoint is None else None
+        self._kept = (m, m.checkpoint()) if keep_before and has_messages(m) else None
+        self._before = m.view.pool.snapshot() if keep_before and self._kept is None else None
         super().__init__(self._inferring(sweeps))
 
     def showing_before(self) -> AbstractContextManager[None]:
-        """While the block runs, queries and files show the map as it was before, with ``keep_before``."""
-        before = self._before if self._checkpoint is None else self._checkpoint.pool
-        assert before is not None, "no copy was kept"
-        return self._map.view.pool.showing(before)
+        """While the block runs, all queries and files show the map as it was before, with ``keep_before``."""
+        if self._kept is not None:
+            return self._kept[0].showing(self._kept[1])
+        assert self._before is not None, "no copy was kept"
+        return self._map.view.pool.showing(self._before)
 
     def _inferring(self, sweeps: int | None) -> Generator[InferProgress, None, InferReport | None]:
         steps = self._map.infer_steps(sweeps=sweeps)
@@ -99,8 +98,8 @@ class FullInference(Settling[InferProgress, InferReport | None]):
                     yield step
                 except StopRequestedError as stop:
                     all_swept = step.sweep > 1 or step.keyframe == step.keyframes
-                    stays = all_swept or self._checkpoint is None
-                    ends = all_swept or self._checkpoint is not None or stop.at_once
+                    stays = all_swept or self._kept is None
+                    ends = all_swept or self._kept is not None or stop.at_once
                     step = steps.throw(stop) if ends else next(steps)
                 else:
                     step = next(steps)
@@ -110,5 +109,5 @@ class FullInference(Settling[InferProgress, InferReport | None]):
             return report if stays else None
         finally:
             steps.close()
-            if not stays and self._checkpoint is not None and has_messages(self._map):
-                self._map.restore(self._checkpoint)
+            if not stays and self._kept is not None:
+                self._kept[0].restore(self._kept[1])

@@ -8,6 +8,7 @@ method defines which bricks a scan reaches and how it changes their voxels; this
 import dataclasses
 import math
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -172,6 +173,13 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         missing = checked_no_return(no_return, depth_m, camera)
         if self._takes_no_return:
             own = dataclasses.replace(own, no_return=missing)
+        elif missing is not None and self.sensor.no_return != "ignore":
+            warnings.warn(
+                f"sensor.no_return: {self.sensor.no_return} has no effect: a map of the method "
+                f"{self.METHOD.name} takes no notice of {int(missing.sum())} pixels without a return. "
+                "Set it to ignore, or map with mrf (free, model) or log_odds (free)",
+                stacklevel=2,
+            )
         if not self._keyframes:
             table = own.noise_model(self.noise, depth).table(camera)
             warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)

@@ -32,12 +32,16 @@ MOST_BRICKS = 2**31 // VOXELS - 1
 
 @dataclass(frozen=True)
 class PoolSnapshot:
-    """A pool at one moment: the sums of messages, what queries read, and which bricks there were."""
+    """A pool at one moment: the sums of messages, what queries read, which bricks there were, and the counts
+    by which what was found of the pool then is known again. ``undated``: other log-odds than the pool's."""
 
     total: "ti.Ndarray"
     belief: "ti.Ndarray"
     bricks: NDArray[np.int32]
     owners: NDArray[np.int32]
+    revision: int
+    restarts: int
+    undated: bool
 
 
 class Dated(Protocol):
@@ -86,7 +90,7 @@ class BrickPool:
         self.evidence: ti.Ndarray | None = None
         self.dated: Dated | None = None
         self._shown: ti.Ndarray | None = None
-        self.shown: PoolSnapshot | None = None  # instead of the pool itself
+        self.shown: PoolSnapshot | None = None  # other log-odds instead of the pool's own
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
@@ -190,7 +194,8 @@ class BrickPool:
         that are shown the snapshot read its sums of messages."""
         total = copied(self.total)
         belief = total if undated or self.dated is None else copied(self.belief)
-        return PoolSnapshot(total, belief, self.bricks.copy(), self.owners.copy())
+        state = self.bricks.copy(), self.owners.copy(), self.revision, self.restarts
+        return PoolSnapshot(total, belief, *state, undated)
 
     def restore(self, snapshot: PoolSnapshot) -> None:
         """Set the sums of messages back to a snapshot's. The bricks must still be the same."""
@@ -203,13 +208,18 @@ class BrickPool:
     @contextmanager
     def showing(self, snapshot: PoolSnapshot) -> Iterator[None]:
         """Let queries and files see a snapshot while the block runs, which must not change the pool."""
-        now = self._shown, self.bricks, self.owners, self.shown
+        now = self._shown, self.bricks, self.owners, self.shown, self.total, self.revision, self.restarts
+        touched = self._touched.copy()  # whoever takes it now has looked at the snapshot
         self._shown, self.bricks, self.owners = snapshot.belief, snapshot.bricks, snapshot.owners
-        self.shown = snapshot
+        if snapshot.undated:
+            self.shown = snapshot
+        else:
+            self.total, self.revision, self.restarts = snapshot.total, snapshot.revision, snapshot.restarts
         try:
             yield
         finally:
-            self._shown, self.bricks, self.owners, self.shown = now
+            self._shown, self.bricks, self.owners, self.shown, self.total, self.revision, self.restarts = now
+            self._touched |= touched
 
     def with_beliefs(self, belief: "ti.Ndarray") -> "BrickPool":
         """The bricks as they are now, with these log-odds (capacity * 512), whatever is shown instead of the

@@ -5,15 +5,22 @@ import pytest
 from numpy.typing import NDArray
 from oracles.alignment import plane_normal, summed
 
-from taichi_mrf.alignment.oriented_points import STRIDE, OrientedPoints, oriented_points
-from taichi_mrf.alignment.point_to_plane import ALIKE, LEAST_WEIGHT, REACH, PointToPlane
+from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
+from taichi_mrf.alignment.point_to_plane import PointToPlane
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
-from taichi_mrf.alignment.surfels import ROUGHNESS, Surfels, merged, surfels_of
+from taichi_mrf.alignment.surfels import Surfels, merged, surfels_of
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+
+# Written out, and not imported: these tests hold the values.
+STRIDE = 2
+ALIKE = 0.7
+LEAST_WEIGHT = 0.001
+REACH = 0.6
+ROUGHNESS = 0.2
 
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 

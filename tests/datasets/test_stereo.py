@@ -19,14 +19,6 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.text import field_help
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.stereo.matching import (
-    BLOCK,
-    MOVE_POWER,
-    MOVE_RANGE_PX,
-    SIGMA_D_PX,
-    SIGMA_PX,
-    SPREAD_OFFSET_PX,
-    SPREAD_POWER,
-    SPREAD_RANGE_PX,
     StereoMatching,
     StereoPairs,
     StereoRig,
@@ -39,6 +31,16 @@ from taichi_mrf.datasets.stereo.matching import (
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise, evaluate
+
+# Written out, and not imported: these tests hold the values.
+BLOCK = 5
+MOVE_POWER = 0.3
+MOVE_RANGE_PX = (0.1, 3.0)
+SIGMA_D_PX = 0.286
+SIGMA_PX = 0.47
+SPREAD_OFFSET_PX = 0.1
+SPREAD_POWER = 1 / 3
+SPREAD_RANGE_PX = (0.06, 3.0)
 
 CAMERA = PinholeCamera(300, 120, 250.0, 250.0, 149.5, 59.5)
 RIG = StereoRig(CAMERA, baseline_m=0.2)

@@ -17,6 +17,7 @@ from taichi_mrf.inference.dated import in_time
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.log_odds import faded
 from taichi_mrf.kernels.types import F32, F32Array
+from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.voxels.layout import VOXELS
@@ -199,6 +200,107 @@ def test_frozen_evidence_passes_through_time_as_a_whole() -> None:
         m.infer(keyframes=[id], sweeps=1)
     ours, theirs = beliefs(frozen), beliefs(kept)
     assert np.mean([np.abs(ours[b] - theirs[b]).mean() for b in ours]) < 0.05
+
+
+ORDERS = [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1), (1, 3), (3,)]
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("order", ORDERS)
+def test_keyframes_may_be_frozen_in_any_order(order: tuple[int, ...]) -> None:
+    kept, m = dated_room([0, 1, 2, 3]), dated_room([0, 1, 2, 3])
+    now_s = m.now_s
+    for id in order:
+        m.freeze_keyframe(id)
+        assert_equal_bits(m, kept)
+    assert m.now_s == now_s
+    assert m._parts.dated is not None
+    assert (m._parts.dated.waiting_bytes > 0) == (order in ((1, 3), (3,)))
+    for id in set(range(4)) - set(order):
+        m.freeze_keyframe(id)
+    assert_equal_bits(m, kept)
+    assert m._parts.dated.waiting_bytes == 0
+
+
+@pytest.mark.usefixtures("backend")
+def test_what_waits_for_a_keyframe_goes_on_when_it_is_removed_or_moved() -> None:
+    kept, m = dated_room([0, 1, 2, 3]), dated_room([0, 1, 2, 3])
+    m.freeze_keyframe(3)
+    m.freeze_keyframe(2)
+    for each in (kept, m):
+        each.move_keyframe(1, small_room.frames()[1].T_world_camera)
+        each.remove_keyframe(0)
+    assert_equal_bits(m, kept)
+    for each in (kept, m):
+        each.remove_keyframe(1)
+    assert_equal_bits(m, kept)
+    assert m._parts.dated is not None
+    assert m._parts.dated.waiting_bytes == 0
+
+
+@pytest.mark.usefixtures("backend")
+def test_files_keep_what_waits(tmp_path: Path) -> None:
+    kept, m = dated_room([0, 1, 2, 3]), dated_room([0, 1, 2, 3])
+    for id in (3, 1):
+        m.freeze_keyframe(id)
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    assert_equal_bits(loaded, m)
+    assert_equal_bits(loaded, kept)
+    for each in (m, loaded):
+        each.infer()
+    assert_equal_bits(loaded, m)
+    for each in (m, loaded):
+        for id in (2, 0):
+            each.freeze_keyframe(id)
+    assert_equal_bits(loaded, m)
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("then_frozen", [False, True])
+def test_a_keyframe_that_comes_after_newer_ones_were_folded_counts_as_of_its_stamp(then_frozen: bool) -> None:
+    """Oracle: the late ones by themselves, through time up to the newer ones, and added to these."""
+    m = dated_room([3, 4])
+    pool, prior = m.view.pool, m.view.pool.prior_log_odds
+    newer = {brick: values.astype(np.float64) for brick, values in beliefs(m).items()}
+    for id in (0, 1):
+        m.freeze_keyframe(id)
+    late = [add(m, 0), add(m, 1)]
+    m.infer(keyframes=late, sweeps=1)
+    expected = {}
+    chain = {brick: np.zeros(VOXELS) for brick in newer}
+    stamps: dict[tuple[int, ...], float] = {}
+    for keyframe in (m.keyframes[id] for id in late):
+        assert keyframe.messages is not None
+        rows = keyframe.messages.to_numpy().reshape(-1, VOXELS)
+        for row, brick in enumerate(map(tuple, pool.bricks[keyframe.visible.slots].tolist())):
+            if brick in newer:
+                gone_s = keyframe.stamp_s - stamps.get(brick, keyframe.stamp_s)
+                chain[brick] = through_time(chain[brick], gone_s) + rows[row]
+                stamps[brick] = keyframe.stamp_s
+    if then_frozen:
+        for id in late[::-1]:
+            m.freeze_keyframe(id)
+    assert m._parts.dated is not None
+    assert m._parts.dated.frozen is not None
+    folded = dict(zip(map(tuple, pool.bricks.tolist()), m._parts.dated.frozen.stamp_s, strict=False))
+    found = beliefs(m)
+    for brick, stamp_s in stamps.items():
+        if folded[brick] == m.now_s == 4 * STEP_S:
+            expected[brick] = newer[brick] + through_time(chain[brick], m.now_s - stamp_s)
+    assert len(expected) > 20
+    differ = np.stack([np.abs(found[brick] - values) for brick, values in expected.items()])
+    assert np.quantile(differ, 0.99) < 0.02  # a glimpse is the rest
+    assert (np.abs(np.stack([expected[b] - newer[b] for b in expected])) > 0.5).mean() > 0.01
+    assert prior < 0
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_of_too_many_dated_keyframes_the_oldest_are_frozen() -> None:
+    m = dated_room([4, 0, 3, 1])
+    assert surplus(m, 0, 2) == [1, 3]
+    static = dated_room([4, 0, 3, 1], None)
+    assert sorted(surplus(static, 0, 1)) == [1, 2, 3]
 
 
 @pytest.mark.usefixtures("backend")

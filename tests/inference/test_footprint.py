@@ -188,6 +188,26 @@ def test_an_image_of_nothing_and_one_of_a_single_pixel(value: float) -> None:
         assert len(footprint.window.bricks_of(footprint.crossed)) == 0
 
 
+def test_rays_with_a_way_in_common_cross_the_bricks_on_it() -> None:
+    """A fine image of a wall: single rays begin far from the camera, and groups of them bring the rest. The
+    bricks are those of all pixels, but for some that few of these graze."""
+    camera = PinholeCamera(width=160, height=120, fx=130, fy=130, cx=79.5, cy=59.5)
+    T = look_at((0.03, 0.21, 0.22), (1.0, 0.3, 0.2))
+    image = uploaded(np.full(camera.shape, 3.0), camera=camera)
+    bundled = RayBundler(VOXEL, InferenceConfig()).rays_of(image)
+    assert bundled.group_number < 0.3 * bundled.number
+    found = find_footprint(image, bundled, T, VOXEL, SENSOR, VolumeConfig())
+    single = rays_of(image, T, found.window, SENSOR.max_depth)
+    some = Rays(single.centre, *(each[::7] for each in (single.directions, single.surface, single.end)))
+    must, _ = bricks_met(some, found.window, whole(found.window), -1.0)  # by a voxel at least
+    may, _ = bricks_met(some, found.window, whole(found.window), 1.0)
+    crossed = set(found.crossed.tolist())
+    assert crossed <= may
+    depth_m = (found.window.bricks_of(found.crossed)[:, 0] + 1) * BRICK * VOXEL
+    assert (depth_m < 2.0).sum() > 20
+    assert len(must - crossed) <= 0.02 * len(must)
+
+
 def test_rays_end_at_max_depth_and_a_measurement_beyond_has_no_surface() -> None:
     depth = scene(3)
     depth[depth > 0] += 1.0

@@ -1,6 +1,7 @@
 """Colours by posterior: against NumPy ray by ray, and what edits and hidden surfaces must not change."""
 
 from pathlib import Path
+from typing import Any
 
 import colored_scene as scene
 import numpy as np
@@ -11,6 +12,7 @@ from one_pixel import VOXEL, FineMap, look_along
 from oracles import inference as reference
 from oracles.forward import Noise
 
+from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.color_sums import ColorShare
@@ -20,7 +22,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.colors import NO_COLOR
-from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 # Written out, and not imported: these tests hold the value.
 WEIGHT_STEPS = 255 / 32
@@ -136,28 +138,71 @@ def test_what_is_frozen_keeps_its_colours() -> None:
         np.testing.assert_array_equal(m.colors(scene.probes()), before)
 
 
+NEARER, FARTHER = [[0.02, 0.02, 1.975]], [[0.02, 0.02, 2.025]]
+
+
+def add_walls(m: MRFMap, depth_m: float, color: tuple[int, int, int], count: int = 1) -> list[int]:
+    """Views of a wall of one colour, about the face between bricks at 2 m."""
+    camera = PinholeCamera(64, 64, 60.0, 60.0, 31.5, 31.5)
+    image = np.full((*camera.shape, 3), color, np.uint8)
+    return [
+        m.add_keyframe(np.full(camera.shape, depth_m), np.eye(4), camera, color=image) for _ in range(count)
+    ]
+
+
+def with_a_brick_gone(**parameters: Any) -> MRFMap:
+    """The frozen view is red and sees the nearer bricks, which only the others had, which are removed."""
+    m = MRFMap(0.05, PolynomialNoise((0.002,)), **parameters)
+    red, greens = add_walls(m, 2.008, (200, 0, 0)), add_walls(m, 1.99, (0, 200, 0), 3)
+    m.infer()
+    assert (m.colors(NEARER + FARTHER)[:, 3] > 0).all()
+    m.freeze_keyframe(red[0])
+    for id in greens:
+        m.remove_keyframe(id)
+    return m
+
+
 @pytest.mark.parametrize("settled", [True, False])
 def test_colours_of_bricks_that_are_gone_go_with_them(tmp_path: Path, settled: bool) -> None:
-    """The wall lies at a face between bricks: the frozen view sees the nearer ones, which the others own."""
-    m, camera = MRFMap(0.05, PolynomialNoise((0.002,))), PinholeCamera(64, 64, 60.0, 60.0, 31.5, 31.5)
-    red, green = np.zeros((*camera.shape, 3), np.uint8), np.zeros((*camera.shape, 3), np.uint8)
-    red[..., 0], green[..., 1] = 200, 200
-    frozen = m.add_keyframe(np.full(camera.shape, 2.008), np.eye(4), camera, color=red)
-    others = [m.add_keyframe(np.full(camera.shape, 1.99), np.eye(4), camera, color=green) for _ in range(3)]
-    m.infer()
-    nearer, farther = [[0.02, 0.02, 1.975]], [[0.02, 0.02, 2.025]]
-    assert (m.colors(nearer + farther)[:, 3] > 0).all()
-    m.freeze_keyframe(frozen)
-    for id in others:
-        m.remove_keyframe(id)
+    m = with_a_brick_gone()
     if settled:
         m.infer()
-        assert m.colors(nearer)[0, 3] == 0
-        np.testing.assert_array_equal(m.colors(farther)[0, :3], (200, 0, 0))
+        assert m.colors(NEARER)[0, 3] == 0
+        np.testing.assert_array_equal(m.colors(FARTHER)[0, :3], (200, 0, 0))
     m.save(tmp_path / "map.npz")
     loaded = MRFMap.load(tmp_path / "map.npz")
     loaded.infer()
-    np.testing.assert_array_equal(loaded.colors(farther)[0, :3], (200, 0, 0))
+    np.testing.assert_array_equal(loaded.colors(FARTHER)[0, :3], (200, 0, 0))
+
+
+def test_colours_of_bricks_that_are_gone_do_not_come_back_with_others() -> None:
+    """The evidence of the frozen view in these bricks is gone, too."""
+    m = with_a_brick_gone()
+    add_walls(m, 1.99, (0, 200, 0))
+    m.infer()
+    np.testing.assert_array_equal(m.colors(NEARER)[0, :3], (0, 200, 0))
+
+
+def test_a_chunk_that_leaves_the_window_holds_no_colours_of_bricks_that_are_gone(tmp_path: Path) -> None:
+    pytest.importorskip("zarr", reason="a window needs the extra store")
+    m = with_a_brick_gone(volume=VolumeConfig(window_m=6.0))
+    assert m.window is not None
+    m.window.park_in(tmp_path / "far.zarr")
+    m.window.follow(m, np.array([50.0, 0.0, 0.0]))
+    assert not m.colors(FARTHER).any()
+    m.window.follow(m, np.zeros(3))
+    np.testing.assert_array_equal(m.colors(FARTHER)[0, :3], (200, 0, 0))
+
+
+def test_recent_colours_are_not_those_of_a_brick_that_had_the_slot_before() -> None:
+    m = with_a_brick_gone()
+    seen = m.recent_colors().reshape(-1, VOXELS, 4).any(axis=(1, 2))
+    slot = int(np.flatnonzero(seen)[0])
+    m._registry._release(np.array([slot], np.int32))  # as when it leaves a window
+    other = m._registry.create(np.array([[40, 40, 40]], np.int32))
+    m.view.pool.owners[other] = 1
+    assert other.tolist() == [slot]
+    assert not m.recent_colors().reshape(-1, VOXELS, 4)[slot].any()
 
 
 def test_nothing_smears_onto_what_stands_behind() -> None:

@@ -1,10 +1,15 @@
 """Full inference step by step: what a stop leaves, with and without a copy of the map before it."""
 
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 import small_room
 from numpy.typing import NDArray
 
+import taichi_mrf as tm
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -128,6 +133,79 @@ def test_what_is_decided_while_a_map_settles_is_what_was_decided_before() -> Non
         with inference.showing_before():
             np.testing.assert_array_equal(m.decided.voxels(0.5)[0], wanted)
             np.testing.assert_array_equal(m.state(wanted), OCCUPIED)
+
+
+def answers(m: MRFMap | LogOddsMap, folder: Path) -> dict[str, NDArray]:
+    """What a user gets of a map: states, decisions, ray casts, exports, and what is in its file."""
+    folder.mkdir()
+    points, slots = small_room.probes(), m.view.pool.in_order
+    found: dict[str, NDArray] = {"state": m.state(points), "marginals": m.occupancy(points)}
+    found["decided"] = m.decided.voxels(0.5)[0]
+    hits = tm.cast_rays(m, np.zeros(3), np.random.default_rng(0).normal(size=(50, 3)), 10.0)
+    found |= {f"rays: {field.name}": np.asarray(getattr(hits, field.name)) for field in fields(hits)}
+    found["seen by"] = m.seen_by(slots)
+    if isinstance(m, MRFMap):
+        found["calibrated"] = m.calibrated().occupancy(points)
+        found["surface"], found["calls"] = m.surface().vertices_m, m.first_surfaces()[slots]
+        found["colours"] = m.colors_in(slots)
+        found["votes"] = np.array(sorted(m.votes_at(points[m.occupancy(points).argmax()]).items()))
+    if isinstance(m, MRFMap) and m.config.time.half_life_s:
+        found["then"], found["static"] = m.at(1.0).occupancy(points), m.static.occupancy(points)
+    for ending in ("bt", "ply"):
+        tm.export_map(m, folder / f"map.{ending}")
+        found[ending] = np.frombuffer((folder / f"map.{ending}").read_bytes(), np.uint8)
+    m.save(folder / "map.npz")
+    with np.load(folder / "map.npz") as file:
+        found |= {f"file: {name}": file[name] for name in file.files if name != "manifest"}
+    return found
+
+
+def painted(half_life_s: float, swept: int) -> MRFMap:
+    """A map with colours, all or some of whose keyframes were swept."""
+    m = MRFMap(small_room.VOXEL_SIZE, time=TimeConfig(half_life_s=half_life_s))
+    for number, frame in enumerate(small_room.frames()[:KEYFRAMES]):
+        color = np.full((*frame.camera.shape, 3), 50 * (number + 1), np.uint8)
+        id = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, color=color)
+        if number < swept:
+            m.infer(sweeps=1, keyframes=[id])
+    return m
+
+
+@pytest.mark.parametrize("asked_before", [True, False])
+@pytest.mark.parametrize("case", ["settled", "live", "one not swept", "dated"])
+def test_while_it_settles_all_that_is_asked_is_of_the_map_at_rest(
+    tmp_path: Path, case: str, asked_before: bool
+) -> None:
+    def build() -> MRFMap:
+        m = painted(100.0 if case == "dated" else 0.0, KEYFRAMES - (case == "one not swept"))
+        if case == "settled":
+            m.infer()
+        return m
+
+    m = build()
+    at_rest = answers(m if asked_before else build(), tmp_path / "before")
+    with FullInference(m, keep_before=True) as inference:
+        for number, _ in enumerate(inference):
+            if number in (0, KEYFRAMES):
+                with inference.showing_before():
+                    during = answers(m, tmp_path / f"during {number}")
+                assert during.keys() == at_rest.keys()
+                for name, values in at_rest.items():
+                    np.testing.assert_array_equal(values, during[name], err_msg=name)
+    afterwards, twin = answers(m, tmp_path / "after"), build()
+    twin.infer()
+    for name, values in answers(twin, tmp_path / "twin").items():
+        np.testing.assert_array_equal(values, afterwards[name], err_msg=name)
+
+
+def test_who_looked_at_the_map_before_is_told_what_has_changed_since() -> None:
+    m = incremental()
+    m.view.pool.take_touched()
+    with FullInference(m, keep_before=True) as inference:
+        for _ in inference:
+            with inference.showing_before():
+                m.view.pool.take_touched()
+    np.testing.assert_array_equal(m.view.pool.take_touched(), m.view.pool.in_use)
 
 
 def test_a_rebuilt_map_ends_where_it_is_told_and_stays_stale() -> None:

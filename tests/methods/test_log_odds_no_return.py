@@ -11,6 +11,7 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.config.sections import LogOddsConfig
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.registry import create_map
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
@@ -150,3 +151,28 @@ def test_rays_of_a_moving_sensor_start_where_it_was() -> None:
             assert (m.state(T_beside[:3, 3] + depth_m * ways) == state).mean() > 0.97
     centres, p = maps[1].voxels(0.0)
     assert (np.abs(maps[0].occupancy(centres) - p) < 1e-5).mean() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("method", "no_return"),
+    [("wavemap", "free"), ("visibility", "free"), ("wavemap", "model"), ("log_odds", "model")],
+)
+def test_a_setting_without_effect_is_said(method: str, no_return: Any) -> None:
+    depth, missing = wall()
+    sensor = SensorConfig(max_depth=REACH_M, no_return=no_return)
+    m = create_map(Config(VOXEL, method, sensor=sensor), CAMERA)
+    with pytest.warns(UserWarning, match=f"{no_return} has no effect: a map of the method {method}.*126 pix"):
+        m.add_keyframe(depth, T, CAMERA, no_return=missing)
+
+
+@pytest.mark.parametrize(
+    ("method", "no_return"), [("wavemap", "ignore"), ("visibility", "ignore"), ("log_odds", "free")]
+)
+def test_nothing_is_said_of_a_setting_that_is_kept(
+    method: str, no_return: Any, recwarn: pytest.WarningsRecorder
+) -> None:
+    depth, missing = wall()
+    sensor = SensorConfig(max_depth=REACH_M, no_return=no_return, no_return_depth=REACH_M)
+    m = create_map(Config(VOXEL, method, sensor=sensor), CAMERA)
+    m.add_keyframe(depth, T, CAMERA, no_return=missing)
+    assert not [each for each in recwarn if "no_return" in str(each.message)]

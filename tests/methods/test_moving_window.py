@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sliding_camera import WALL_M
 from window_walk import CHUNK_M, OUT, WINDOW_M, add, probes, unwindowed, walk, walk_both, windowed
 
 from taichi_mrf.config.sections import TimeConfig
@@ -143,6 +144,30 @@ def test_dated_evidence_comes_back_with_its_date(tmp_path: Path) -> None:
     static = unwindowed()
     walk(static, [*OUT, 4.0, 2.0, 0.0])
     assert np.abs(static.occupancy(in_memory) - occupancy).max() > 0.05
+
+
+def test_what_waits_for_older_keyframes_leaves_with_its_chunk(tmp_path: Path) -> None:
+    """The way back of a recording that comes last to first: the window freezes the newest."""
+    options = {"time": TimeConfig(half_life_s=2.0)}
+    m, other = windowed(tmp_path / "far.zarr", **options), unwindowed(**options)
+    for number, place_m in enumerate(OUT):
+        ids = [add(each, place_m, number, stamp_s=-float(number)) for each in (m, other)]
+        for id in m.frozen.keys() & other.keyframes.keys():
+            other.freeze_keyframe(id)
+        m.renew(ids[:1])
+        other.renew(ids[1:])
+    assert m.window is not None
+    assert m._parts.dated is not None
+    assert m._parts.dated.waiting_bytes > 0
+    assert len(m.window.parked) > 1
+    for each in (m, other):
+        for id in list(each.keyframes):
+            each.freeze_keyframe(id)
+    m.window.follow(m, np.zeros(3))
+    beside = np.stack([np.linspace(0.0, 0.5, 50), np.full(50, 0.02), np.full(50, WALL_M)], axis=1)
+    assert (m.occupancy(beside) > 0.3).mean() > 0.5
+    in_memory, occupancy = m.voxels(0.0)
+    np.testing.assert_allclose(occupancy, other.occupancy(in_memory), atol=1e-4)
 
 
 def test_memory_is_bounded_on_a_long_way(tmp_path: Path) -> None:

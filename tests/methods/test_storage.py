@@ -29,6 +29,16 @@ def test_a_loaded_map_goes_on_as_if_it_had_never_been_saved(tmp_path: Path) -> N
     np.testing.assert_array_equal(loaded.occupancy(probes), small_room.build([1, 2]).occupancy(probes))
 
 
+def test_a_loaded_map_knows_at_once_who_sees_a_voxel(tmp_path: Path) -> None:
+    m = small_room.build([0, 1, 2])
+    seen = m.seen_by(m.view.pool.in_order)
+    assert seen.max() == 3
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    np.testing.assert_array_equal(loaded.seen_by(loaded.view.pool.in_order), seen)
+    np.testing.assert_array_equal(loaded.occupancy(small_room.probes()), m.occupancy(small_room.probes()))
+
+
 def test_patch_noise_is_stored(tmp_path: Path) -> None:
     camera = PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)
     tables = np.random.default_rng(0).uniform(0.01, 0.02, (2, 12, 2))

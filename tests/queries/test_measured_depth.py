@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.queries.measured_depth import AROUND, GRAZING, NEAR_M, NEAR_VOXELS, NONE, STEP, MeasuredDepth
+from taichi_mrf.queries.measured_depth import NONE, MeasuredDepth
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.voxels.distance_field import MARGIN, DistanceField, blended_sums
+from taichi_mrf.voxels.distance_field import DistanceField, blended_sums
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 # Written out, and not imported: these tests hold the value.
+AROUND = 2
+GRAZING = 3.0
+NEAR_M = 0.075
+NEAR_VOXELS = 1.5
+STEP = 0.5
+MARGIN = 1
 LEAST_WEIGHT = 0.02
 
 CAMERA = PinholeCamera(24, 18, 20.0, 20.0, 11.5, 8.5)

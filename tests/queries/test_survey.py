@@ -26,10 +26,13 @@ from oracles.survey import SLIVER, Surveyed
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.geometry.poses import Pose, look_at
-from taichi_mrf.queries.survey import OPAQUE, Occlusion, SurfaceSurvey, doubting
+from taichi_mrf.queries.survey import Occlusion, SurfaceSurvey, doubting
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
 from taichi_mrf.voxels.pool import BrickPool
+
+# Written out, and not imported: these tests hold the values.
+OPAQUE = 0.001
 
 pytestmark = pytest.mark.usefixtures("backend")
 

@@ -33,15 +33,18 @@ def unwindowed(**options: Any) -> MRFMap:
     return MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128), **options)
 
 
-def add(m: MRFMap, place_m: float, number: int = 0, colored: bool = False) -> int:
+def add(
+    m: MRFMap, place_m: float, number: int = 0, colored: bool = False, stamp_s: float | None = None
+) -> int:
     """A keyframe ``place_m`` along the wall, with noise that depends on place and ``number``, perhaps with a
-    colour image."""
+    colour image and a stamp."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, 3] = place_m, 0.013, 0.021
     random = np.random.default_rng((int(place_m * 1000) + 10**6, number))
     depth_m = (WALL_M + random.normal(0.0, 0.004, CAMERA.shape)).astype(np.float32)
     color = random.integers(1, 256, (*CAMERA.shape, 3)).astype(np.uint8) if colored else None
-    return m.add_keyframe(depth_m, T_world_camera, CAMERA, f"{place_m:g} m, {number}", color=color)
+    name = f"{place_m:g} m, {number}"
+    return m.add_keyframe(depth_m, T_world_camera, CAMERA, name, stamp_s, color=color)
 
 
 def walk(m: MRFMap, places_m: Iterable[float], colored: bool = False) -> list[int]:

@@ -49,8 +49,8 @@ class Live:
     """Start over when the sequence ends; its frames become new keyframes."""
 
     keep_live: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Keep at most N keyframes editable and freeze the others, those out of view first, so that an endless
-    run needs a bounded amount of memory."""
+    """Keep at most N keyframes editable and freeze the others, the oldest first (in a static world those out
+    of view), so that an endless run needs a bounded amount of memory."""
 
     exit_when_done: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """End once the sequence is mapped."""

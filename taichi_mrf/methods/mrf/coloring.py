@@ -41,7 +41,8 @@ class MapColors:
         self._beliefs = pool
         self._registry, self._keyframes, self._refresh = registry, keyframes, refresh
         self._sweeper = sweeper
-        self.frozen = ColorShare.nothing()
+        self._frozen = ColorShare.nothing()
+        self._gone: list[NDArray[np.int32]] = []  # bricks whose part of it is still to be dropped
         self._colors = np.zeros((0, 4), np.uint8)
         self._found_at: tuple[int, int] | None = None
         self._sums: ColorSums | None = None  # kept with follow()
@@ -55,7 +56,7 @@ class MapColors:
         """The colours that some keyframes gave, and perhaps frozen ones, by the beliefs of ``pool``."""
         parts = (self._registry, keyframes, self._sweeper, self._refresh, pool)
         some = MapColors(*parts)
-        some.frozen = self.frozen if with_frozen else some.frozen
+        some._frozen = self.frozen if with_frozen else some._frozen
         return some
 
     def __bool__(self) -> bool:
@@ -101,11 +102,26 @@ class MapColors:
                 self._counted[id] = keyframe
         return self._sums.colors()
 
+    @property
+    def frozen(self) -> ColorShare:
+        """What frozen keyframes gave to the voxels that there still are."""
+        if self._gone:
+            gone, self._gone = grid_keys(np.concatenate(self._gone)), []
+            self._frozen = self._frozen.chosen(~np.isin(grid_keys(self._frozen.bricks), gone))
+        return self._frozen
+
+    def forget(self, bricks: NDArray[np.int32]) -> None:
+        """Bricks (n, 3) have been released: what frozen keyframes gave to them goes with them, as evidence
+        does, and their slots will be those of others."""
+        self._sums = None
+        if len(self._frozen.numbers):
+            self._gone.append(bricks)
+
     def freeze(self, keyframe: Keyframe) -> None:
         """Keep for good what a keyframe gives; it is about to be frozen."""
         if keyframe.color is not None:
             self._refresh(keyframe)
-            self.restore(self._pass.share(keyframe, self._registry.pool))
+            self._frozen = self.frozen.plus(self._pass.share(keyframe, self._registry.pool))
         self._counted.pop(keyframe.id, None)  # its share stays in the sums
 
     def frozen_in(self, chunks: NDArray[np.int32]) -> ColorShare:
@@ -114,12 +130,12 @@ class MapColors:
 
     def release(self, chunks: NDArray[np.int32]) -> None:
         """Remove what frozen keyframes gave to the voxels of some chunks, (n, 3)."""
-        self.frozen = self.frozen.chosen(~self._inside(chunks))
+        self._frozen = self.frozen.chosen(~self._inside(chunks))
 
     def restore(self, share: ColorShare) -> None:
         """Add to what frozen keyframes gave."""
         if len(share.numbers):
-            self.frozen = self.frozen.plus(share)
+            self._frozen, self._sums = self.frozen.plus(share), None
 
     def stored(self, slots: NDArray[np.int32], settled: bool) -> NDArray[np.uint8]:
         """Colours of all bricks for a map file, (n,) slots -> (n, 512, 4); (0, 512, 4) if there are none, or
@@ -156,15 +172,8 @@ class MapColors:
 
     def _of_frozen(self) -> ColorSums:
         sums = ColorSums(self._registry.pool)
-        if len(self.frozen.numbers):
-            left = self.left()
-            sums.add(left, self._registry.topology.slots(left.bricks))
+        sums.add(self.frozen, self._registry.topology.slots(self.frozen.bricks))
         return sums
-
-    def left(self) -> ColorShare:
-        """What frozen keyframes gave to the voxels that there still are: a brick that they only saw goes with
-        the last keyframe that has it."""
-        return self.frozen.chosen(self._registry.topology.slots(self.frozen.bricks) >= 0)
 
     def _inside(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
         return np.isin(grid_keys(self.frozen.bricks // CHUNK), grid_keys(chunks))

@@ -1,5 +1,7 @@
 """The contributions of frozen keyframes as arrays of a file, a map's or a parked chunk's."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.inference.brick_sums import LARGEST, VOTES, BrickSums
 from taichi_mrf.inference.color_sums import ColorShare
+from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import NEVER
 from taichi_mrf.methods.map_file import read_places
 from taichi_mrf.methods.mrf.kept_rays import RayShare
@@ -34,6 +37,63 @@ def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray
     belief = file.array("frozen_belief", "f", (bricks, VOXELS))
     stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
     return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)
+
+
+@dataclass(frozen=True)
+class WaitingMessages:
+    """Messages (n, 512) of a frozen keyframe that wait for older ones (inference/dated.py), and the
+    coordinates (n, 3) of their bricks."""
+
+    stamp_s: float
+    content: bytes
+    bricks: NDArray[np.int32]
+    messages: NDArray[np.floating]
+
+
+def waiting_of(beliefs: DatedBelief) -> list[WaitingMessages]:
+    """What of a map waits, as far as its bricks are still there."""
+    found = []
+    for each in beliefs.waiting():
+        rows = np.flatnonzero(
+            each.left & (beliefs.pool.identity[each.visible.slots] == each.visible.identity)
+        )
+        messages = each.messages.to_numpy()[: len(each.left) * VOXELS].reshape(-1, VOXELS)[rows]
+        bricks = beliefs.pool.bricks[each.visible.slots[rows]]
+        found.append(WaitingMessages(each.stamp_s, each.content, bricks, messages))
+    return found
+
+
+def waiting_arrays(waiting: Sequence[WaitingMessages]) -> dict[str, NDArray]:
+    """Arrays of a file: the messages that wait; none without any."""
+    if not waiting:
+        return {}
+    return {
+        "waiting_stamps": np.array([each.stamp_s for each in waiting], np.float64),
+        "waiting_content": np.stack([np.frombuffer(each.content, np.uint8) for each in waiting]),
+        "waiting_counts": np.array([len(each.bricks) for each in waiting], np.int64),
+        "waiting_bricks": np.concatenate([each.bricks for each in waiting]),
+        "waiting_messages": np.concatenate([each.messages for each in waiting]),
+    }
+
+
+def read_waiting(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> list[WaitingMessages]:
+    """The messages that wait in a file with bricks (n, 3). Raises MapFileError if they are of others."""
+    if "waiting_stamps" not in file:
+        return []
+    stamps = file.array("waiting_stamps", "f", (None,)).tolist()
+    content = file.integers("waiting_content", (len(stamps), None), 0, 255).astype(np.uint8)
+    span = SparseTopology.HALF_SPAN
+    places = file.integers("waiting_bricks", (None, 3), -span, span - 1).astype(np.int32)
+    messages = file.array("waiting_messages", "f", (len(places), VOXELS))
+    counts = file.integers("waiting_counts", (len(stamps),), 0, len(places))
+    if counts.sum() != len(places) or not np.isin(grid_keys(places), grid_keys(bricks)).all():
+        raise MapFileError(
+            f"{path}: damaged: waiting_bricks are not of its bricks, or not waiting_counts many"
+        )
+    ends = np.cumsum(counts)
+    parts = [slice(end - count, end) for count, end in zip(counts.tolist(), ends.tolist(), strict=True)]
+    rows = zip(stamps, content, parts, strict=True)
+    return [WaitingMessages(s, key.tobytes(), places[part], messages[part]) for s, key, part in rows]
 
 
 def color_arrays(share: ColorShare) -> dict[str, NDArray]:

@@ -1,11 +1,12 @@
 """Inference in an MRFMap: which keyframes are swept, from which messages, and how a stopped run is undone.
 
 Full inference starts by dropping all messages. A caller that may have to stop it, to carry out an edit for
-instance, takes a checkpoint first: the beliefs, which queries can keep reading (BrickPool.showing), and the
-messages behind them. Between checkpoint and return no keyframe may be added, removed or moved.
+instance, takes a checkpoint first: the beliefs, which queries can keep reading (showing), and the messages
+behind them. Between checkpoint and return no keyframe may be added, removed or moved.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.inference.keyframe import VisibleBricks
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.schedule import InferSteps, content_key, driven, sweep_steps
 from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.parts import MapParts
@@ -31,7 +32,8 @@ else:
 @dataclass(frozen=True)
 class Checkpoint:
     """A map's beliefs, and for each keyframe its visible bricks, its messages for them, and the bricks'
-    change counts at its last sweep."""
+    change counts at its last sweep. With the beliefs it keeps a state that was, whole: for queries to read
+    (:func:`showing`) and to go back to."""
 
     pool: PoolSnapshot
     messages: dict[int, "tuple[VisibleBricks, ti.Ndarray | None, NDArray[np.int64] | None]"]
@@ -95,8 +97,15 @@ def freeze_keyframe(parts: MapParts, id: int) -> None:
     parts.surfels.freeze(keyframe)
     parts.decisions.frozen(id)
     parts.frozen[id] = keyframe.name
+    drop(parts, id)
+
+
+def drop(parts: MapParts, id: int) -> None:
+    """Forget a keyframe that was taken out or frozen. Frozen ones may have waited for it."""
     del parts.keyframes[id]
     parts.settled = False
+    if parts.dated is not None:
+        parts.dated.fold_for_good()
 
 
 def show(parts: MapParts, slots: NDArray[np.int32], log_odds: NDArray[np.float32]) -> None:
@@ -126,14 +135,37 @@ def take_checkpoint(parts: MapParts) -> Checkpoint:
     )
 
 
+@contextmanager
+def showing(parts: MapParts, checkpoint: Checkpoint) -> Iterator[None]:
+    """MRFMap.showing: beliefs and messages are those of the checkpoint while the block runs."""
+    names = ("visible", "messages", "change_count_at_last_sweep", "pending_visible", "revision")
+    keyframes, settled = list(parts.keyframes.values()), parts.settled
+    now = [{name: getattr(keyframe, name) for name in names} for keyframe in keyframes]
+    try:
+        with parts.pool.showing(checkpoint.pool):
+            parts.settled = checkpoint.settled
+            for keyframe in keyframes:
+                _give_back(keyframe, checkpoint)
+            yield
+    finally:
+        parts.settled = settled
+        for keyframe, values in zip(keyframes, now, strict=True):
+            for name, value in values.items():
+                setattr(keyframe, name, value)
+
+
+def _give_back(keyframe: Keyframe, checkpoint: Checkpoint) -> None:
+    """Give a keyframe its messages as of a checkpoint."""
+    then = checkpoint.messages[keyframe.id]
+    keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = then
+    keyframe.pending_visible = None
+
+
 def go_back(parts: MapParts, checkpoint: Checkpoint) -> None:
     """Restore beliefs and messages as of the checkpoint."""
     parts.pool.restore(checkpoint.pool)
     for keyframe in parts.keyframes.values():
-        keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = checkpoint.messages[
-            keyframe.id
-        ]
-        keyframe.pending_visible = None
+        _give_back(keyframe, checkpoint)
     parts.messages_lost, parts.settled = checkpoint.messages_lost, checkpoint.settled
     parts.allocator.mark_without_messages(parts.keyframes.values())
     if parts.dated is not None:

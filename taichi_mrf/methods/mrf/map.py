@@ -5,6 +5,7 @@ parts (parts.py), and of functions that work on them, whose modules are loaded w
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -173,8 +174,7 @@ class MRFMap(BrickMap):
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
-        del self._keyframes[id]
-        self._parts.settled = False
+        inferring.drop(self._parts, id)
 
     def move_keyframe(
         self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
@@ -295,6 +295,12 @@ class MRFMap(BrickMap):
         """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
         inferring.go_back(self._parts, checkpoint)
 
+    def showing(self, checkpoint: inferring.Checkpoint) -> AbstractContextManager[None]:
+        """While the block runs, all queries and files are those of the map at a checkpoint, as it was at
+        rest: its states, ray casts, layers, surface and colours. The block must not change the map. Since the
+        checkpoint only :meth:`infer_steps` may have been begun."""
+        return inferring.showing(self._parts, checkpoint)
+
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> "depth_graph.FactorGraph":
         """The factor graph without average messages, for factor_graph.solve: a factor for the ray of every
         ``every``-th pixel in both directions, and one for each voxel's prior; its cells are the pool's
@@ -317,6 +323,7 @@ class MRFMap(BrickMap):
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
         """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
         frozen ones count as one; 255 means 255 or more."""
+        inferring.restore_messages(self._parts)
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, sent, self._pool)
 

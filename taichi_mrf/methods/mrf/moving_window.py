@@ -197,6 +197,8 @@ class MovingWindow:
         """Contents that frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
         pool, frozen_crossed = self._registry.pool, self._registry.frozen_crossed
         pool.keep_evidence()
+        if self._parts.dated is not None:  # no keyframe that is not frozen sees these chunks
+            self._parts.dated.fold_for_good(slots)
         surfels = self._parts.surfels.frozen_in(chunks)
         slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
         surfels_of = dict(by_chunk(surfels.cells // BRICK))

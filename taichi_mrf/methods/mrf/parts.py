@@ -109,6 +109,8 @@ class MapParts:
         note_sweep = None if beliefs is None else beliefs.note_sweep
         renewing = (bounds, allocator.look_again, allocator.refresh, inference.renew_tolerance, note_sweep)
         kept = KeptRays(config.keep_surface)
+        colors = MapColors(registry, keyframes, sweeper, allocator.refresh)
+        registry.on_release = colors.forget
         return MapParts(
             config=config,
             prior=prior,
@@ -119,7 +121,7 @@ class MapParts:
             sweeper=sweeper,
             incremental=IncrementalInference(pool, sweeper, *renewing),
             surfels=KeyframeSurfels(config.voxel_size, config.sensor.max_depth),
-            colors=MapColors(registry, keyframes, sweeper, allocator.refresh),
+            colors=colors,
             kept=kept,
             decisions=Decisions(registry, keyframes, kept, sweeper),
             keyframes=keyframes,
@@ -172,14 +174,14 @@ class MapParts:
 
     def statistics(self) -> MapStatistics:
         """The size of the map."""
-        keyframes = self.keyframes.values()
+        keyframes, waiting = self.keyframes.values(), 0 if self.dated is None else self.dated.waiting_bytes
         images = sum(k.image_bytes for k in keyframes)
         return measure(
             self.pool,
             keyframes=len(keyframes),
             frozen=len(self.frozen),
             rays=sum(k.rays for k in keyframes),
-            message_bytes=sum(k.voxel_bytes for k in keyframes),
+            message_bytes=sum(k.voxel_bytes for k in keyframes) + waiting,
             other_bytes=images + self.sweeper.nbytes + self.found_bytes,
         )
 

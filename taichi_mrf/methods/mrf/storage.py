@@ -23,12 +23,16 @@ from taichi_mrf.methods.map_file import (
     read_places,
 )
 from taichi_mrf.methods.mrf.frozen_arrays import (
+    WaitingMessages,
     color_arrays,
     dated_arrays,
     ray_arrays,
     read_color_share,
     read_dated,
     read_rays,
+    read_waiting,
+    waiting_arrays,
+    waiting_of,
 )
 from taichi_mrf.methods.mrf.inferring import show
 from taichi_mrf.methods.mrf.kept_rays import RayShare
@@ -43,7 +47,8 @@ from taichi_mrf.voxels.layout import VOXELS
 class MapContents:
     """The contents of an MRFMap's file. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
     (n, 3); of a dated map ``total`` (n, 512) are those of all evidence together, whatever its age, and
-    ``frozen_dated`` is what frozen keyframes say of the voxels, and as of when (n);
+    ``frozen_dated`` is what frozen keyframes say of the voxels, and as of when (n), and ``waiting`` what
+    others of them have still to say;
     ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
     chunks that are not in memory (parked_chunks.py). ``colors`` (n, 512, 4) are those of the voxels, or (0,
@@ -55,6 +60,7 @@ class MapContents:
     evidence: NDArray[np.float32] | None
     total: NDArray[np.float32] | None
     frozen_dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
+    waiting: list[WaitingMessages]
     frozen_owners: NDArray[np.int32]
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
@@ -88,12 +94,13 @@ def contents_of(header: MapHeader, parts: MapParts, parked: list[str]) -> MapCon
         None if pool.evidence is None else pool.read("evidence", slots),
         None if dated is None else pool.read("total", slots),
         None if dated is None else dated.read_frozen(slots),
+        [] if dated is None else waiting_of(dated),
         pool.owners[slots] - live[slots],
         registry.frozen_crossed,
         parts.frozen,
         parked,
         parts.colors.stored(slots, header.settled),
-        parts.colors.left(),
+        parts.colors.frozen,
         parts.kept.share,
     )
 
@@ -122,6 +129,9 @@ def show_contents(contents: MapContents, parts: MapParts, slots: NDArray[np.int3
             pool.write("evidence", slots, contents.evidence)
         if dated is not None and contents.frozen_dated is not None:
             dated.restore_frozen(slots, *contents.frozen_dated)
+            for each in contents.waiting:
+                at = parts.registry.topology.slots(each.bricks)
+                dated.wait(each.stamp_s, each.content, at, each.messages)
         show(parts, slots, contents.belief)
         if dated is not None and contents.total is not None:
             pool.write("total", slots, contents.total)
@@ -147,7 +157,7 @@ def write_contents(path: Path, contents: MapContents) -> None:
     if contents.parked:
         arrays["parked"] = np.array(contents.parked, np.str_)
     if contents.frozen_dated is not None:
-        arrays |= dated_arrays(*contents.frozen_dated)
+        arrays |= dated_arrays(*contents.frozen_dated) | waiting_arrays(contents.waiting)
     if len(contents.colors) and contents.colors.any():
         arrays["colors"] = contents.colors
     arrays |= color_arrays(contents.frozen_colors) | ray_arrays(contents.kept)
@@ -171,6 +181,7 @@ def read_contents(path: Path) -> MapContents:
             file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
             file.array("total", "f", (n, VOXELS)).astype(np.float32) if "total" in file else None,
             read_dated(file, n),
+            read_waiting(path, file, bricks),
             file.integers("frozen_owners", (n,), 0, len(frozen_ids)).astype(np.int32),
             read_places(path, file, "frozen_crossed"),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),

@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 from oracles.forward import Noise
 from oracles.traversal import segments
 from taichi_mrf.config.sections import InferenceConfig
-from taichi_mrf.inference.ray_list import CLEAR_VOXELS
-from taichi_mrf.inference.ray_model import END_SIGMAS, Limits
+from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.forward import SUPPORT
+
+# Written out, and not imported: these tests hold the values.
+CLEAR_VOXELS = 2.0
+END_SIGMAS = 3.0
+SUPPORT = 6.5
 
 Voxel = tuple[int, int, int]
 
