@@ -105,9 +105,9 @@ because its poses are off by a part of a voxel. Lidar: the building."""
 def default_promise(m: Any) -> FreePromise:
     """The bounds of a map that was not calibrated, by the camera of its keyframes. Raises ConfigError for a
     map of another method than mrf: its log-odds have no table."""
-    if m.config.method != "mrf":
+    if not m.METHOD.has_messages:
         raise ConfigError(
-            f"a map of the method {m.config.method} has no default for levels of free space: calibrate it "
+            f"a map of the method {m.METHOD.name} has no default for levels of free space: calibrate it "
             "with taichi_mrf.evaluation.free_space.calibrate_free"
         )
     cameras = (getattr(k, "camera", None) for k in m.keyframes.values())

@@ -200,11 +200,7 @@ class Panel(BasePanel):
                 "voxels": f"{status.voxels:,} in {status.bricks:,} bricks",
                 "memory of the map": f"{status.memory_mb:,.0f} MB",
                 "edits": "inference is not finished" if status.pending else "all in the map",
-                **(
-                    {"free space": status.free_space.removeprefix("free space is ")}
-                    if status.free_space
-                    else {}
-                ),
+                "free space": status.free_space.removeprefix("free space is ") or "not calibrated",
             }
         )
 
@@ -429,8 +425,7 @@ class VoxelAnswer:
         """The keyframes that are listed."""
 
     def move(self, point: Point, place: tuple[float, float]) -> None:
-        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and draw a line from the voxel
-        before."""
+        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and a line from the one before."""
         before, self.point = self.point, point
         self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
         self._panel.visible = True
