@@ -425,7 +425,7 @@ class VoxelAnswer:
         """The keyframes that are listed."""
 
     def move(self, point: Point, place: tuple[float, float]) -> None:
-        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and a line from the one before."""
+        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and a line from the last."""
         before, self.point = self.point, point
         self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
         self._panel.visible = True
