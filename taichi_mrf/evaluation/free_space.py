@@ -297,7 +297,7 @@ def _before_ends(
     ends = T[:3, 3] + ways * ends_m.reshape(-1)[pixels, None]
     points_m = ends[:, None] - back_m[:, None] * units[:, None]
     log_odds, state = states_at(decided, points_m.reshape(-1, 3))
-    return np.where(state == FREE, log_odds, np.nan).reshape(len(pixels), -1)
+    return np.where(state == FREE, log_odds, np.nan).reshape(len(pixels), len(back_m))
 
 
 def _lost(log_odds: NDArray[np.float64], bound: float) -> float:

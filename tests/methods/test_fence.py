@@ -91,11 +91,14 @@ def test_posts_of_a_fence_stay_and_gaps_stay_open() -> None:
 
 
 def test_posts_stay_in_voxels_wider_than_they_are_more_so_if_rays_may_pass() -> None:
-    shares = {}
+    """Others are unknown, because the next post is but two voxels away; none is called free."""
+    shares, likelier = {}, {}
     for pass_through in (0.0, 0.1):
         m = mapped(0.1, pass_through)
         posts, gaps = (m.state(post_points(aside)) for aside in (0.0, 0.5 * GAP_M))
         shares[pass_through] = (posts == OCCUPIED).mean()
+        likelier[pass_through] = (m.occupancy(post_points()) > 0.5).mean()
         assert (gaps == FREE).mean() > 0.9
+        assert not (posts == FREE).any()
     assert shares[0.1] > 0.9
-    assert 0.75 < shares[0.0] < shares[0.1]
+    assert likelier[0.0] + 0.1 < shares[0.0] < shares[0.1]
