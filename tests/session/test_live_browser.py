@@ -546,6 +546,7 @@ def test_a_signal_ends_it_while_a_page_watches_and_keeps_what_is_mapped(
     program: LiveProgram, browser: "Browser", out: Path
 ) -> None:
     with LivePage(browser, program.address) as page:
+        page.until_settled()  # so that few keyframes are those of the new map
         page.select("Speed", "0.25x")
         reset(page)
         page.until(lambda seen: seen.agrees and seen.voxels and 1 <= len(seen.keyframes) < 4, "voxels")
