@@ -243,7 +243,7 @@ def print_map(console: Terminal, facts: Facts) -> None:
         table.add_row("world", f"may change, half-life {half_life:g} s" if half_life else "static")
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
     if facts.get("free_space"):
-        table.add_row("free space", facts["free_space"].removeprefix("free space is "))
+        table.add_row("free space", facts["free_space"])
     if "surface" in facts:
         held = [name for name in ("colors", "surface") if facts[name]]
         table.add_row("also holds", " and ".join(held) or "neither colors nor surface")

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.held_out import surface_depth
@@ -268,6 +267,8 @@ def _sees(
     """Whether a measured ray passes a voxel or ends in it: centres (n, 3) in the camera's frame -> (n,)."""
     flat, measured_m = rays.reshape(-1, 3), np.asarray(depth_m).reshape(-1)
     if isinstance(camera, RayTable):
+        from scipy.spatial import cKDTree  # takes a third of a second to import
+
         units = flat / np.linalg.norm(flat, axis=1, keepdims=True)
         lengths = np.maximum(np.linalg.norm(points_m, axis=1, keepdims=True), 1e-9)
         pixel, inside = cKDTree(units).query(points_m / lengths)[1], np.ones(len(points_m), np.bool_)

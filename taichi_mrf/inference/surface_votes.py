@@ -39,9 +39,9 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Str
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.numbering import flat, strip_begin, strip_length, voxel_number
+from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool, PoolPart
-from taichi_mrf.voxels.traversal import walk_voxels, within
+from taichi_mrf.voxels.traversal import voxel_in, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
 FOR, AGAINST = 3, 2
@@ -156,7 +156,8 @@ class _Vote(RayVisitor):
         sigma, inside = sight.noise.sigma(depth), depth > sight.begin and depth < sight.end
         blur = sigma * sight.voxels_per_depth
         if inside and blur <= BLURRED:
-            voxel = _voxel_at(sight.ray, depth, sight.space)
+            place = sight.ray.origin + depth * sight.ray.direction
+            voxel = voxel_in(sight.space, ti.cast(ti.floor(place), ti.i32))
             if voxel >= 0:
                 said = ENDED
                 if blur > SHARP:
@@ -172,18 +173,6 @@ class _Vote(RayVisitor):
                 one = ti.cast(1, ti.i64) << _SILENT
             voting = _Voting(self.counts, one, surface, until, sight.voxels_per_depth)
             walk_voxels(sight.ray, sight.begin, sight.end, sight.space, _vote_against, ahead, voting)
-
-
-@ti.func
-def _voxel_at(ray: Template, depth: F32, space: Template) -> I32:
-    """The voxel that a ray is in at a depth, -1 where there is none."""
-    cell = ti.cast(ti.floor(ray.origin + depth * ray.direction), ti.i32)
-    brick, voxel = cell >> 3, -1
-    if within(brick, space.shape):
-        slot = space.bricks[flat(brick, space.shape)]
-        if slot >= 0:
-            voxel = slot * VOXELS + voxel_number(cell & 7)
-    return voxel
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.arguments import array, real
+from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.points import FREE, checked_points, state_of
-from taichi_mrf.queries.within import path_places
+from taichi_mrf.queries.within import checked_paths, path_places
 from taichi_mrf.sensor.distortion import DistortedCamera
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system.compiler import ti
@@ -79,16 +79,16 @@ class FreePromise:
         return {"says": self.sentence(), "blocks": self.blocks, "levels": self.levels.tolist(), **figures}
 
     def sentence(self, level: float = DEFAULT_LEVEL) -> str:
-        """What is promised at one of the levels, in one line."""
+        """How far free space is promised at one of the levels, in one line."""
         i = int(np.argmin(np.abs(self.levels - level)))
         if not self.blocks:
-            return f"free space is promised at {level:.0%} by the default table: no frames were held out"
+            return f"promised at {level:.0%} by the default table: no frames were held out"
         if self.bound[i] <= NEVER:
-            return f"free space cannot be promised at {level:.0%}: held-out frames saw too little of it"
+            return f"not promised at {level:.0%}: held-out frames saw too little of it"
         low, high = (_percent(values[i]) for values in (self.held_least, self.held_most))
         held = low if low == high else f"{low} to {high}"
         return (
-            f"free space is promised at {level:.0%}: {held}% held on {self.blocks} frames that the "
+            f"promised at {level:.0%}: {held}% held on {self.blocks} frames that the "
             f"map has not seen, {100 * self.lost_m[i]:.1f} cm of clearance lost"
         )
 
@@ -97,9 +97,10 @@ _DEFAULT_BOUNDS = {
     "depth camera": (-3.5, -4.375, -5.0, -8.5, -9.0, -9.0, -9.0, -12.0),
     "lidar": (-2.375, -3.625, -4.125, -5.75, -6.75, -9.0, -9.0, -9.0),
 }
-"""Bounds of LEVELS for an MRFMap that was not calibrated, in voxels of 5 cm. Depth camera: the lowest of the
-house, the room, the coffin scene, rooms with thin things and the kitchen, which is the lowest at each level,
-because its poses are off by a part of a voxel. Lidar: the building."""
+"""Bounds of LEVELS for an MRFMap that was not calibrated, in voxels of 5 cm. They were measured before thin
+things had a rule (inference/thin_matter.py), which has made the least sure voxels fewer. Depth camera: the
+lowest of the house, the room, the coffin scene, rooms with thin things and the kitchen, which is the lowest
+at each level, because its poses are off by a part of a voxel. Lidar: the building."""
 
 
 def default_promise(m: Any) -> FreePromise:
@@ -142,18 +143,15 @@ def free_with(m: Any, points: ArrayLike, level: float, radius_m: float) -> NDArr
 
 def path_free_with(m: Any, points: ArrayLike, radius_m: float, level: float) -> NDArray[np.bool_]:
     """BrickMap.path_free_with."""
-    given = array(points, "points")
-    if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.shape[-2] == 0:
-        raise ConfigError(f"a path needs points of shape (N, 3) or (P, N, 3), not {given.shape}")
+    paths, whole = checked_paths(points)
     radius_m = real(radius_m, "radius_m", least=0)
-    paths = checked_points(given.reshape(-1, 3)).reshape(-1, *given.shape[-2:])
     step_m = max(0.5 * radius_m, 0.25 * m.voxel_size)
     places, path_of = path_places(paths, step_m)
     # Balls so much larger cover the way between two of them.
     there = free_with(m, places, level, math.hypot(radius_m, 0.5 * step_m))
     free = np.ones(len(paths), np.bool_)
     np.logical_and.at(free, path_of, there)
-    return free.reshape(given.shape[:-2])
+    return free.reshape(whole)
 
 
 def box_free_with(m: Any, lower: ArrayLike, upper: ArrayLike, level: float) -> bool:

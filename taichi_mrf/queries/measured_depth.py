@@ -23,8 +23,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.blended_field import blended, cell_of
 from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, DistanceField
 from taichi_mrf.voxels.layout import BRICK, VOXELS
-from taichi_mrf.voxels.numbering import flat, voxel_number
-from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, within
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, voxel_in
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 NEAR_VOXELS, NEAR_M = 1.5, 0.075
@@ -157,12 +156,9 @@ def _may_be(ray: Template, depth: F32, to_voxels: F32, space: Template, free: Te
     may = 0
     for k in range(-AROUND, AROUND + 1):
         voxel = ti.cast(ti.floor(ray.origin + (depth + k / to_voxels) * ray.direction), ti.i32)
-        brick = voxel >> 3
-        if within(brick, space.shape):
-            row = space.bricks[flat(brick, space.shape)]
-            if row >= 0:
-                number = voxel_number(voxel & 7)
-                may |= 1 - ((free[row * WORDS + (number >> 5)] >> (number & 31)) & 1)
+        number = voxel_in(space, voxel)
+        if number >= 0:
+            may |= 1 - ((free[number >> 5] >> (number & 31)) & 1)
     return may
 
 
@@ -195,10 +191,7 @@ def _distance(space: Template, mean: Template, place: Vec3) -> Vec4:
 @ti.func
 def _voxel(space: Template, mean: Template, voxel: IVec3) -> F32:
     """The mean distance of one voxel of the window, NONE where there is none."""
-    value = NONE
-    brick = voxel >> 3
-    if within(brick, space.shape):
-        row = space.bricks[flat(brick, space.shape)]
-        if row >= 0:
-            value = mean[row * VOXELS + voxel_number(voxel & 7)]
+    value, number = NONE, voxel_in(space, voxel)
+    if number >= 0:
+        value = mean[number]
     return value

@@ -132,16 +132,22 @@ def path_collision(
 
     The rest as in :func:`occupied_within`; also raises ConfigError for a path without points.
     """
-    given = array(points, "points")
-    if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.shape[-2] == 0:
-        raise ConfigError(f"a path needs points of shape (N, 3) or (P, N, 3), not {given.shape}")
-    paths = checked_points(given.reshape(-1, 3)).reshape(-1, *given.shape[-2:])
+    paths, whole = checked_paths(points)
     step = _PLACES_APART * real(radius_m, "radius_m", above=0)
     places, path_of = path_places(paths, step)
     there = occupied_within(places, radius_m, voxel_size, topology, pool, seen_free)
     likeliest = np.zeros(len(paths), np.float32)
     np.maximum.at(likeliest, path_of, there)
-    return likeliest.reshape(given.shape[:-2])
+    return likeliest.reshape(whole)
+
+
+def checked_paths(points: ArrayLike) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+    """A path (N, 3) or paths (P, N, 3) as paths, and the shape of an answer for each of them. Raises
+    ConfigError for another shape, a path without points and a point that is not finite."""
+    given = array(points, "points")
+    if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.shape[-2] == 0:
+        raise ConfigError(f"a path needs points of shape (N, 3) or (P, N, 3), not {given.shape}")
+    return checked_points(given.reshape(-1, 3)).reshape(-1, *given.shape[-2:]), given.shape[:-2]
 
 
 def path_places(paths: NDArray[np.float64], step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

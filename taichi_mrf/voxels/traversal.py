@@ -152,6 +152,18 @@ def within(cell: IVec3, count: IVec3) -> I32:
 
 
 @ti.func
+def voxel_in(space: Template, cell: IVec3) -> I32:
+    """Index of a voxel among those of its space's bricks (bricks * 512), -1 where no brick is; ``cell``
+    counts voxels from the window's corner."""
+    brick, voxel = cell >> 3, -1
+    if within(brick, space.shape):
+        slot = space.bricks[flat(brick, space.shape)]
+        if slot >= 0:
+            voxel = slot * VOXELS + voxel_number(cell & 7)
+    return voxel
+
+
+@ti.func
 def inside_eight(cell: IVec3) -> I32:
     """True if a cell lies among the 8^3 of its parent: a voxel in a brick, a brick in a chunk."""
     return ((cell[0] | cell[1] | cell[2]) & -8) == 0

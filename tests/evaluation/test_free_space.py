@@ -10,6 +10,8 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.free_space import (
     STEPS,
+    _ended_in,
+    _sees,
     averaged,
     bounds_of,
     calibrate_free,
@@ -19,6 +21,7 @@ from taichi_mrf.evaluation.free_space import (
 )
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.free import LEVELS, NEVER
+from taichi_mrf.sensor.camera import PinholeCamera
 
 BINS = len(STEPS) + 1
 
@@ -99,6 +102,8 @@ def test_what_a_block_holds_is_judged_by_the_others() -> None:
     held = held_share(ends, visited)
     np.testing.assert_allclose(held[3, 0], 0.7)
     np.testing.assert_allclose(held[:3, 0], 1.0)
+    # By its own ends, twice 300 of 5000, the last block's bin would not be free at 95%.
+    np.testing.assert_allclose(held[3, LEVELS.index(0.95)], 0.7)
 
 
 def test_ends_are_averaged_within_planes_only() -> None:
@@ -122,6 +127,28 @@ def test_uncertain_ends_do_not_count() -> None:
     assert (certain_ends(depth_m, np.full((20, 20), 0.5), 0.05) == 0).all()
 
 
+CAMERA = PinholeCamera(40, 40, 160.0, 160.0, 19.5, 19.5)
+
+
+def test_an_end_counts_if_one_ray_in_twenty_of_its_voxel_has_it() -> None:
+    """At 1 m a voxel of 5 cm has (160 x .05)^2 = 64 rays."""
+    ends_m, rays = np.full(CAMERA.shape, 2.0), CAMERA.rays()
+    for pixels, counts in ((2, False), (5, True)):
+        ends_m[20, 20 : 20 + pixels] = 1.01
+        voxels = _ended_in(rays, ends_m, np.eye(4), 0.05)
+        assert (voxels[:, 2] == 20).any() == counts
+    assert (voxels[:, 2] == 40).sum() > 20
+
+
+def test_a_frame_looks_into_what_lies_before_its_ends() -> None:
+    depth_m = np.full(CAMERA.shape, 2.0)
+    depth_m[:, :10] = 0
+    points_m = np.array([[0, 0, 1.0], [0, 0, 2.0], [0, 0, 2.2], [0, 0, -1.0], [0.5, 0, 1.0], [-0.1, 0, 1.0]])
+    seen = _sees(CAMERA, CAMERA.rays(), depth_m, points_m, 0.05)
+    # In front, where it ends, behind it, behind the camera, beside the image, where nothing was measured.
+    assert seen.tolist() == [True, True, False, False, False, False]
+
+
 @pytest.mark.usefixtures("one_backend")
 def test_a_map_is_calibrated_by_frames_that_it_has_not_seen() -> None:
     dataset = open_dataset("synthetic:room?width=120&height=90&frames=20")
@@ -140,4 +167,5 @@ def test_a_map_is_calibrated_by_frames_that_it_has_not_seen() -> None:
     assert (promise.held_least <= promise.held_most).all()
     assert promise.held_least[LEVELS.index(0.9)] > 0.9
     assert (np.diff(promise.lost_m) >= 0).all()
+    assert 0 < promise.lost_m[-1] <= 1.0  # of the last metre of a ray
     assert calibrate_free(m, frames[1:9:4]) is None

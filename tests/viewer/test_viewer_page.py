@@ -168,7 +168,7 @@ def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
     numbers = handled.page.panel._numbers
     handled.take(status)
     assert "not calibrated" in numbers.content
-    handled.take(replace(status, free_space="free space is promised at 99%: 98.9 to 99.3% held"))
+    handled.take(replace(status, free_space="promised at 99%: 98.9 to 99.3% held"))
     assert "promised at 99%: 98.9 to 99.3% held" in numbers.content
 
 

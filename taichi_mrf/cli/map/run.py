@@ -256,11 +256,7 @@ def _report_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("seconds", seconds),
         ("accuracy", _accuracy_text(report["accuracy"])),
-        *(
-            [("free space", report["free_space"]["says"].removeprefix("free space is "))]
-            if report["free_space"]
-            else []
-        ),
+        *([("free space", report["free_space"]["says"])] if report["free_space"] else []),
     ]
 
 

@@ -200,7 +200,7 @@ class Panel(BasePanel):
                 "voxels": f"{status.voxels:,} in {status.bricks:,} bricks",
                 "memory of the map": f"{status.memory_mb:,.0f} MB",
                 "edits": "inference is not finished" if status.pending else "all in the map",
-                "free space": status.free_space.removeprefix("free space is ") or "not calibrated",
+                "free space": status.free_space or "not calibrated",
             }
         )
 
