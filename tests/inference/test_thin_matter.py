@@ -36,9 +36,9 @@ def pose(x_m: float) -> NDArray[np.float64]:
     return T_world_camera
 
 
-def mapped(posts: NDArray[np.bool_], **parameters: object) -> MRFMap:
+def mapped(posts: NDArray[np.bool_], noise: PolynomialNoise = NOISE, **parameters: object) -> MRFMap:
     """A map of keyframes, in some of which the post is there."""
-    m = MRFMap(VOXEL, NOISE, **parameters)
+    m = MRFMap(VOXEL, noise, **parameters)
     for i, (x_m, there) in enumerate(zip(STEPS_M, posts, strict=True)):
         m.add_keyframe(depth_image(x_m, bool(there)), pose(x_m), CAMERA, f"{i}", float(i))
     return m
@@ -78,32 +78,71 @@ def test_what_was_there_in_two_of_ten_keyframes_is_not_occupied(first: int) -> N
     assert not (m.state(post_points()) == OCCUPIED).any()
 
 
-@pytest.mark.usefixtures("backend")
-def test_scores_are_those_of_keyframes_with_ends_and_without() -> None:
-    there = ALWAYS.copy()
-    there[[2, 5, 6]] = False
-    m = mapped(there)
-    m.infer()
+def scores_of(m: MRFMap, voxels: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The scores of voxels (n, 3), brought up to date by a query."""
     m.state([[0.0, 0.0, 0.0]])
     scores = m._parts.decisions._votes.to_numpy().reshape(-1, 512, 2)[..., 1]
-    topology = m._parts.registry.topology
-    cell = np.floor(post_points() / VOXEL).astype(np.int64)
-    slots = topology.slots((cell // 8).astype(np.int32))
-    inside = cell % 8
-    number = (inside[:, 0] * 8 + inside[:, 1]) * 8 + inside[:, 2]
-    passing = np.array([[rays_through(k, x_m) for x_m in STEPS_M[~there]] for k in cell])
-    assert (passing > 10).all()
-    # A nat is 20: log(1 / .02) for an end, 1.5 against at most.
-    assert (scores[slots, number] == 7 * 78 - np.minimum(passing, 30).sum(axis=1)).all()
+    slots = m._parts.registry.topology.slots((voxels // 8).astype(np.int32))
+    inside = voxels % 8
+    return scores[slots, (inside[:, 0] * 8 + inside[:, 1]) * 8 + inside[:, 2]]
 
 
-def rays_through(voxel: NDArray[np.int64], x_m: float) -> int:
-    """How many rays of a camera at (x, 0, 0) lie in a voxel for more than a tenth of its size."""
+def passing(voxel: NDArray[np.int64], x_m: float, there: bool, sigma_m: float = 0.004) -> int:
+    """How many rays of a camera at (x, 0, 0) lie in a voxel for more than a tenth of its size, and leave it
+    three sigmas before what they measure if that is the post, which no voxel explains."""
     u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     to = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     faces = (np.stack([voxel, voxel + 1]) * VOXEL - [x_m, 0, 0])[:, None, None] / to
-    inside = faces.max(axis=0).min(axis=-1) - faces.min(axis=0).max(axis=-1)
-    return int((inside * np.linalg.norm(to, axis=-1) > 0.1 * VOXEL).sum())
+    enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
+    depth_m = depth_image(x_m, there)
+    before = (depth_m == np.float32(WALL_M)) | (leaves <= depth_m - 3 * sigma_m)
+    return int(((leaves - enters) * np.linalg.norm(to, axis=-1) > 0.1 * VOXEL)[before].sum())
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize(("sigma_m", "says"), [(0.004, 78), (0.02, 40)])
+def test_scores_are_those_of_keyframes_with_ends_and_without(sigma_m: float, says: int) -> None:
+    """A nat is 20: log(1 / .02) for an end with a sigma of at most a quarter of a voxel, log(1 / .135) for
+    another, and up to 1.5 against for each keyframe whose rays pass."""
+    there = ALWAYS.copy()
+    there[[2, 5, 6]] = False
+    m = mapped(there, PolynomialNoise(sigma=(sigma_m,)))
+    m.infer()
+    post = np.floor(post_points() / VOXEL).astype(np.int64)
+    against = [sum(min(passing(k, x_m, False), 30) for x_m in STEPS_M[~there]) for k in post]
+    np.testing.assert_array_equal(scores_of(m, post), 7 * says - np.array(against))
+    if says == 78:
+        around = np.concatenate([np.add(post, (0, 0, z)) for z in (-4, -2, 1)])  # in the same brick
+        by_hand = np.array([[passing(k, *each) for each in zip(STEPS_M, there, strict=True)] for k in around])
+        assert by_hand.min() < 30 < by_hand.max()
+        np.testing.assert_array_equal(scores_of(m, around), -np.minimum(by_hand, 30).sum(axis=1))
+
+
+@pytest.mark.usefixtures("backend")
+def test_a_keyframe_whose_rays_all_end_in_a_voxel_says_nothing() -> None:
+    m = MRFMap(VOXEL, NOISE)
+    m.add_keyframe(depth_image(0.025, with_post=False), pose(0.025), CAMERA)  # above the voxel's middle
+    m.infer()
+    wall = np.array([[0, 0, 40]])
+    assert m.state((wall + 0.5) * VOXEL) == OCCUPIED
+    assert scores_of(m, wall) == 0
+
+
+@pytest.mark.usefixtures("backend")
+def test_in_a_world_that_may_change_scores_fade_in_the_order_of_stamps() -> None:
+    """A quarter of what speaks for matter, a sixteenth of what speaks against it."""
+    there = np.array([False, False, False, True, True, False, True, False, False, False])
+    m = mapped(there, time=TimeConfig(half_life_s=LIVE_HALF_LIFE_S))
+    m.infer()
+    post = np.floor(post_points() / VOXEL).astype(np.int64)
+    wanted = []
+    for voxel in post:
+        score = 0
+        for x_m, is_there in zip(STEPS_M, there, strict=True):
+            score -= score >> (2 if score > 0 else 4)
+            score += 78 if is_there else -min(passing(voxel, x_m, False), 30)
+        wanted.append(score)
+    np.testing.assert_array_equal(scores_of(m, post), wanted)
 
 
 @pytest.mark.usefixtures("backend")
