@@ -52,8 +52,9 @@ class PixelNoise(Struct):
 
     @ti.func
     def sigma_slope(self, depth: F32):
-        """Derivative of sigma by depth, without the bound from below."""
-        return slope(self.sigma_terms, depth)
+        """Derivative of sigma by depth."""
+        bounded = polynomial(self.sigma_terms, depth) <= LEAST_SIGMA_M
+        return ti.select(bounded, 0.0, slope(self.sigma_terms, depth))
 
     @ti.func
     def bias_slope(self, depth: F32):
@@ -65,8 +66,7 @@ class SensorNoise(Bundle):
     """The base of all noise in kernels."""
 
     at_pixel: ClassVar[Any]
-    """A ti.func, as PolynomialTable has it. What it returns has the methods of PixelNoise, and may hold
-    whatever a pixel needs."""
+    """A ti.func, as PolynomialTable has it. It returns an object with the methods of PixelNoise."""
 
     own_sigmas: ClassVar[bool] = False
     """True if pixels of one patch differ: then there is a ``sigma_level``, as ScaledTable has it."""
@@ -107,8 +107,7 @@ class ScaledPixelNoise(Struct):
     @ti.func
     def sigma(self, depth: F32):
         """Standard deviation of the measurement of a surface at ``depth``, at least LEAST_SIGMA_M."""
-        unscaled = ti.max(polynomial(self.sigma_terms, depth), LEAST_SIGMA_M)
-        return ti.max(self.scale * unscaled, LEAST_SIGMA_M)
+        return ti.max(self.scale * ti.max(polynomial(self.sigma_terms, depth), LEAST_SIGMA_M), LEAST_SIGMA_M)
 
     @ti.func
     def bias(self, depth: F32):
@@ -117,8 +116,9 @@ class ScaledPixelNoise(Struct):
 
     @ti.func
     def sigma_slope(self, depth: F32):
-        """Derivative of sigma by depth, without the bound from below."""
-        return self.scale * slope(self.sigma_terms, depth)
+        """Derivative of sigma by depth."""
+        bounded = ti.min(self.scale, 1.0) * polynomial(self.sigma_terms, depth) <= LEAST_SIGMA_M
+        return ti.select(bounded, 0.0, self.scale * slope(self.sigma_terms, depth))
 
     @ti.func
     def bias_slope(self, depth: F32):

@@ -5,7 +5,7 @@ the compiler holds Python's lock, so nothing can be said while it works, only be
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,6 +31,8 @@ class Compiling:
 
 
 so_far = Compiling()
+all_passes: dict[str, Collection[str]] = {}
+"""Settings of the compiler that are off, and the kernels, by name, that are compiled with them on."""
 _listeners: list[Callable[[], None]] = []
 _unlaunched: set[Any] = set()
 
@@ -93,11 +95,15 @@ def _timed(name: str) -> Iterator[None]:
     program = type(compiler.program())
     compile_kernel = program.compile_kernel
 
-    def compile_timed(*arguments: Any) -> Any:
+    def compile_timed(program: Any, config: Any, *arguments: Any) -> Any:
         begin = time.thread_time()
+        for setting, kernels in all_passes.items():
+            setattr(config, setting, name in kernels)
         try:
-            return compile_kernel(*arguments)
+            return compile_kernel(program, config, *arguments)
         finally:
+            for setting in all_passes:
+                setattr(config, setting, False)
             so_far.seconds[name] = so_far.seconds.get(name, 0.0) + time.thread_time() - begin
 
     program.compile_kernel = compile_timed

@@ -17,7 +17,7 @@ from typing import Any
 
 import taichi_mrf
 from taichi_mrf.errors import BackendError
-from taichi_mrf.system import compiler, devices, owner, taichi_environment
+from taichi_mrf.system import compiler, compiling, devices, owner, taichi_environment
 
 BACKENDS = ("cuda", "vulkan", "cpu")
 """In the order in which "auto" tries them."""
@@ -29,10 +29,13 @@ ABILITIES = {
 }
 """The kind of map that each backend supports: Vulkan has no sparse fields."""
 
-FEWER_PASSES = {"cpu": "advanced_optimization", "software": "cfg_optimization"}
-"""The compiler's optimisation that is switched off: it takes nine tenths of the time of compiling, and a
-keyframe is a few hundredths slower without it (docs/compilers.md). Vulkan cannot do without the advanced one.
-A GPU keeps both: none was at hand to measure."""
+FEWER_PASSES: dict[str, dict[str, tuple[str, ...]]] = {
+    "cpu": {"advanced_optimization": ("_choose", "_write_down", "_find_reach")},
+    "cuda": {"advanced_optimization": ("_choose", "_write_down", "send_messages")},
+    "software": {"cfg_optimization": ()},
+}
+"""The compiler's optimisation that is off, because it takes nine tenths of the time of compiling, and the
+kernels of a new keyframe that it is on for (docs/compilers.md). Vulkan cannot do without the advanced one."""
 
 SOFTWARE_BLOCK = 8
 """Threads in a block of a software device: in larger ones Mesa's Vulkan skips iterations of long loops."""
@@ -199,8 +202,8 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
     ti = _quiet_taichi()
     options: dict[str, Any] = {"cpu_max_num_threads": _usable(threads)} if threads else {}
     options["kernel_profiler"] = profile
-    if passes := FEWER_PASSES.get("software" if software else name):
-        options[passes] = False
+    for setting, kernels in FEWER_PASSES.get("software" if software else name, {}).items():
+        options[setting], compiling.all_passes[setting] = False, kernels
     if software:
         options["default_gpu_block_dim"] = SOFTWARE_BLOCK
     arch = getattr(ti, name)

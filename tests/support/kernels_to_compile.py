@@ -1,4 +1,4 @@
-"""A kernel that no other test launches."""
+"""Kernels that only one test launches, each."""
 
 from taichi_mrf.kernels import bundles  # noqa: F401 (launches are watched)
 from taichi_mrf.kernels.types import F32Array
@@ -9,3 +9,15 @@ from taichi_mrf.system.compiler import ti
 def double(values: F32Array):  # noqa: ANN201 (Taichi allows no None)
     for i in range(values.shape[0]):
         values[i] *= 2.0
+
+
+@ti.kernel
+def triple(values: F32Array):  # noqa: ANN201
+    for i in range(values.shape[0]):
+        values[i] *= 3.0
+
+
+@ti.kernel
+def quadruple(values: F32Array):  # noqa: ANN201
+    for i in range(values.shape[0]):
+        values[i] *= 4.0

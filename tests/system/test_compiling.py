@@ -1,13 +1,15 @@
 """Words for the time in which a run waits for the compiler of kernels."""
 
+import itertools
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from taichi_mrf.system import compiling
+from taichi_mrf.system import compiler, compiling, runtime
 
 PROGRAM = """
 import sys
@@ -54,6 +56,37 @@ def test_first_launches_are_counted_by_kernel(backend: str) -> None:
         double(values)
         assert compiling.so_far.number == before + 1
         assert told == []
+
+
+def test_a_kernel_that_is_named_has_all_passes_and_the_next_has_not(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kernels_to_compile import quadruple, triple
+
+    from taichi_mrf.system.compiler import ti
+
+    compile_kernel, asked = type(compiler.program()).compile_kernel, []
+
+    def note(program: Any, config: Any, *arguments: Any) -> Any:
+        asked.append(config.advanced_optimization)
+        return compile_kernel(program, config, *arguments)
+
+    monkeypatch.setattr(type(compiler.program()), "compile_kernel", note)
+    monkeypatch.setattr(compiling, "all_passes", {"advanced_optimization": ("triple",)})
+    monkeypatch.setattr(ti.cfg, "advanced_optimization", False)
+    values = ti.ndarray(ti.f32, 3)
+    for kernel in (triple, quadruple):
+        kernel(values)
+        kernel(values)
+    assert asked[0]  # Taichi asks at each launch, and keeps what the first one made
+    assert not any(asked[1:])
+
+
+def test_kernels_that_keep_all_passes_are_kernels_of_this_package() -> None:
+    sources = [path.read_text(encoding="utf-8") for path in Path(compiling.__file__).parents[1].rglob("*.py")]
+    for settings in runtime.FEWER_PASSES.values():
+        for name in itertools.chain(*settings.values()):
+            assert sum(f"@kernel\ndef {name}(" in source for source in sources) == 1, name
 
 
 def test_words_are_worth_it_after_a_second_since_the_last_step(monkeypatch: pytest.MonkeyPatch) -> None:
