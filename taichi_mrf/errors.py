@@ -35,6 +35,10 @@ class DatasetError(TaichiMRFError):
     """A recording cannot be read; the text names the folder or the file."""
 
 
+class ReadWrongError(DatasetError):
+    """A recording is surely not read as it was written; the text says what is odd, and what reads it."""
+
+
 class FrameError(DatasetError):
     """One frame of a recording is broken; the text names the frame and the file.
 

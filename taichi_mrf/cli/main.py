@@ -6,16 +6,17 @@ from collections.abc import Sequence
 
 import taichi_mrf
 from taichi_mrf.cli.parser import parse
+from taichi_mrf.cli.shared.output import READ_WRONG
 from taichi_mrf.cli.shared.terminal import PROGRAM, print_problem
-from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.errors import ReadWrongError, TaichiMRFError
 
 BAD_INPUT = 2
 ABORTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status: 0, or 2 after one line on stderr that says what is
-    wrong, or 128 plus the signal's number for a run that was stopped."""
+    """Run one command and return the exit status: 0, or 2 (4 for a recording that is surely read wrong) after
+    one line on stderr that says what is wrong, or 128 plus the signal's number for a run that was stopped."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"{PROGRAM} {taichi_mrf.__version__}")
@@ -23,6 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command, options = parse(arguments)
         return command.run(options)
+    except ReadWrongError as error:
+        print_problem(str(error))
+        return READ_WRONG
     except TaichiMRFError as error:
         print_problem(str(error))
         return BAD_INPUT

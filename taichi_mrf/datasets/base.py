@@ -124,8 +124,9 @@ class Dataset(ABC):
         """Origin of the frames in the recorded world, (3,) metres: add it to their coordinates."""
         return np.zeros(3)
 
-    def check_scale(self, poses_are_used: bool) -> list[str]:
-        """Check the unit of depth, once the camera is final, and return notes; empty for a known unit."""
+    def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
+        """Check the unit of depth, once the camera is final, and return notes; empty for a known unit.
+        ``pose`` gives T_world_camera (4, 4) of a frame, and is None where frames have none."""
         return []
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:

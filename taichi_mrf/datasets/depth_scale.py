@@ -49,8 +49,9 @@ def seen_again(
     return SeenAgain(expected, np.where(inside, second[rows, columns], 0.0), rows, columns)
 
 
-USUAL = (1000.0, 5000.0)
-"""Steps per metre of millimetres (Kinect, RealSense, Redwood) and of TUM RGB-D and ICL-NUIM."""
+USUAL = (1000.0, 5000.0, 4000.0, 6553.5, 10000.0, 256.0)
+"""Steps per metre of millimetres (Kinect, RealSense, Redwood), of TUM RGB-D and ICL-NUIM, of RealSense's
+finer unit, of Replica, of tenths of millimetres, and of KITTI."""
 
 PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
 """A median depth outside this range is reported as implausible."""
@@ -152,8 +153,8 @@ def gather(
             continue
         if other.shape == camera.shape:
             found = [_difference(steps, other, T_second_first, camera, scale) for scale in candidates]
-            if not any(np.isnan(found)):
-                differences.append(found)
+            if not all(np.isnan(found)):  # with a wrong scale the one may see nothing of the other
+                differences.append(np.nan_to_num(found, nan=1.0))
     median = float(np.median(medians)) if medians else None
     if not differences:
         return Evidence(median, {})

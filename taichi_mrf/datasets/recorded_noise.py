@@ -88,7 +88,7 @@ def _with_reach(settings: Config, dataset: Dataset) -> Config:
     given = sensor.max_depth != SensorConfig().max_depth
     if own is not None and not given:
         return _reaching(settings, dataset, own, "as far as the first scan reaches")
-    depths_m = _some_depths(dataset)
+    depths_m = some_depths(dataset)
     beyond = float((depths_m > sensor.max_depth).mean()) if depths_m.size else 0.0
     useful = _useful_depth(sensor, depths_m)
     if beyond <= MUCH or useful == sensor.max_depth:
@@ -110,7 +110,7 @@ def _reaching(settings: Config, dataset: Dataset, reach_m: float, why: str) -> C
     return replace(settings, sensor=replace(settings.sensor, max_depth=reach_m))
 
 
-def _some_depths(dataset: Dataset) -> NDArray[np.float32]:
+def some_depths(dataset: Dataset) -> NDArray[np.float32]:
     """The measured depths of a few frames, (n,) metres; none of a camera, whose frames are read only once."""
     depths = [np.zeros(0, np.float32)]
     last = len(dataset) - 1 if not dataset.endless else -1
@@ -139,7 +139,7 @@ def _with_floor(settings: Config, dataset: Dataset) -> Config:
     if given.outlier_floor is not None:
         return settings
     short = dataset.stated.pass_through is None and reach_m <= SensorConfig().max_depth
-    depths_m = _some_depths(dataset) if short else np.zeros(0, np.float32)
+    depths_m = some_depths(dataset) if short else np.zeros(0, np.float32)
     if depths_m.size:
         short = float(np.minimum(depths_m, reach_m).mean()) * given.surface_density <= LONG_RAY
     return _with_outliers(settings, SHORT_RAYS_FLOOR) if short else settings

@@ -3,8 +3,8 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,8 @@ class Recording(Table[RecordedFrame]):
     scale_stated: bool = False
     color: bool = True
     color_camera: ColorCamera | None = None
+    scale_notes: list[str] = field(default_factory=list)
+    """Notes of the last check of the scale."""
 
     @property
     def stated(self) -> StatedSensor:
@@ -94,8 +96,8 @@ class Recording(Table[RecordedFrame]):
         color = read_color(path, self.color_camera.camera)
         return self.color_camera.registered(color, depth_m, camera)
 
-    def check_scale(self, poses_are_used: bool) -> list[str]:
-        """Compare neighbouring frames at the recorded poses, and note which scale is used and why.
+    def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
+        """Compare neighbouring frames at their poses, and note which scale is used and why.
 
         A scale of the format is replaced by a usual one with which neighbouring frames agree clearly better;
         one that a file or the caller gives is kept, and a note says that another would agree better.
@@ -109,8 +111,8 @@ class Recording(Table[RecordedFrame]):
             self.steps_per_metre, self.scale_source = 1.0, "metres, as the images hold floats"
         own = self.steps_per_metre
         found = gather(
-            len(self.rows) if poses_are_used else min(1, len(self.rows)),
-            self.pose,
+            len(self.rows) if pose is not None else min(1, len(self.rows)),
+            pose or self.pose,
             lambda index: read_depth(self.rows[index].depth_file, 1.0, self.camera),
             self.camera,
             tuple(dict.fromkeys((own, *USUAL))),
@@ -142,6 +144,7 @@ class Recording(Table[RecordedFrame]):
                 f"depth: {self.steps_per_metre:g} steps per metre make a median depth of {median_m:.3g} m, "
                 "which is not plausible; check --depth-scale"
             )
+        self.scale_notes = notes
         return notes
 
 

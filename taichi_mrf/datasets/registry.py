@@ -19,7 +19,7 @@ from typing import Any
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
-from taichi_mrf.datasets.derived import mended, resampled
+from taichi_mrf.datasets.derived import mended, pose_of, resampled
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.ros.names import is_bag
@@ -166,7 +166,9 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
         dataset.camera = PinholeCamera(recorded.width, recorded.height, *options.intrinsics)
     conventions = options.conventions
     dataset.tracked = dataset.tracked or options.track
-    dataset.notes += dataset.check_scale(not (dataset.tracked or conventions.of_poses))
+    dataset.notes += dataset.check_scale(
+        None if dataset.tracked else lambda index: pose_of(dataset.pose(index), conventions)
+    )
     distortion = dataset.distortion if options.undistort is None else options.undistort
     picked = resampled(dataset, distortion, options.stride)
     picked.tracked = dataset.tracked

@@ -7,11 +7,11 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
-from taichi_mrf.datasets.depth_scale import out_of_sight
+from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, out_of_sight
 from taichi_mrf.datasets.derived import Derived, Mended
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.doctor.readings import UNITS, Reading
-from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
+from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -43,7 +43,8 @@ class Finding:
 class Diagnosis:
     """``findings`` are what is odd, ``undecided`` what the recording cannot tell. ``before`` and ``after``
     say by how much frames that see the same differ, as a share of depth, as they were read and with the
-    ``reading`` that explains them; None where that is not known."""
+    ``reading`` that explains them; None where that is not known. ``contradicted``: frames see through what
+    others saw, and no reading explains it."""
 
     findings: tuple[Finding, ...]
     undecided: tuple[str, ...] = ()
@@ -51,6 +52,12 @@ class Diagnosis:
     before: float | None = None
     after: float | None = None
     search: Search | None = None
+    contradicted: bool = False
+
+
+def unexplained(found: Diagnosis) -> Diagnosis:
+    """A diagnosis whose findings do not mend the recording."""
+    return Diagnosis((), (_NO_READING,), before=found.before, contradicted=True)
 
 
 def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
@@ -91,12 +98,14 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     if best == given and before > _CONTRADICTING:
         apart = out_of_sight(dataset)
-        return Diagnosis((Finding(apart),) if apart else (), (_NO_READING,), given)
+        through = search.seen_through(given) > SEEN_THROUGH
+        return Diagnosis((Finding(apart),) if apart else (), (_NO_READING,), given, contradicted=through)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
     if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
-        return Diagnosis((), (_NO_READING,), given)
-    best = _with_unit_of_poses(best, steps)
+        through = search.seen_through(given) > SEEN_THROUGH
+        return Diagnosis((), (_NO_READING,), given, contradicted=through)
+    best = _with_likeliest_units(best, given, steps, sample)
     found = tuple(_findings(given, best, steps, source))
     return Diagnosis(found, undecided, best, before, search.score(best), search)
 
@@ -110,19 +119,17 @@ def mistakes(dataset: Dataset) -> list[str]:
     return [f"{each.text} ({each.flag} mends it)" if each.flag else each.text for each in found]
 
 
-def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
-    """Mistakes of a recording, found soon, before anything is mapped: none if most of the frames that can be
-    read in so many seconds explain each other, or if they are too few to tell."""
+def doubtful_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> bool:
+    """True if a recording, of which nothing is mapped yet, wants a longer look: most of the frames that can
+    be read in so many seconds do not explain each other. False if they are too few to tell."""
     if dataset.endless or dataset.tracked:
-        return []
+        return False
     try:
         search = Search(read_sample(dataset, seconds), Reading(), 1.0)
     except DatasetError:
-        return []
+        return False
     off = search.differences(Reading())
-    if len(off) < FEWEST_PAIRS or (off <= EXPLAINED).mean() >= _MOST_EXPLAINED:
-        return []
-    return mistakes(dataset)
+    return len(off) >= FEWEST_PAIRS and bool((off <= EXPLAINED).mean() < _MOST_EXPLAINED)
 
 
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:
@@ -146,15 +153,8 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
     if best.factor != given.factor:
         right = steps / best.factor
-        unit = _unit_of_depth(right)
-        if unit == UNITS[1.0] and right != steps:
-            text = (
-                "poses and depths are in one unit, and that is not metres: with millimetres, divide positions"
-            )
-            found.append(Finding(f"{text} by 1000", "--depth-scale 1000"))
-        else:
-            text = f"depth has {right:.6g} steps per metre ({unit}), not {steps:.6g}"
-            found.append(Finding(text, f"--depth-scale {right:.6g}"))
+        text = f"depth has {right:.6g} steps per metre ({_unit_of_depth(right)}), not {steps:.6g}"
+        found.append(Finding(text, f"--depth-scale {right:.6g}"))
     if best.lens and isinstance(source.camera, PinholeCamera):
         k = best.camera_of(source.camera)
         flag = f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
@@ -162,15 +162,29 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
     return found
 
 
-def _with_unit_of_poses(best: Reading, steps: float) -> Reading:
-    """The reading in which it is the poses that have another unit, if depth with the factor would have none
-    that sensors have (no sensor counts whole metres), or if they are in metres."""
-    factor = best.factor * POSE_UNITS.get(best.unit, 1.0)
-    unit = {1.0: "", **{factor: unit for unit, factor in POSE_UNITS.items()}}.get(round(factor, 9))
-    of_poses = unit == "" or _unit_of_depth(steps / best.factor) in ("", UNITS[1.0])
-    if best.factor == 1.0 or unit is None or not of_poses:
+def _with_likeliest_units(best: Reading, given: Reading, steps: float, sample: Sample) -> Reading:
+    """The likeliest of the readings that differ from the best one by the size of the whole world: no
+    comparison of frames tells those apart. Surfaces lie where sensors see them, depth has a unit that sensors
+    have (none counts whole metres), and little differs from what was given."""
+    if best.factor == given.factor and best.unit == given.unit:
         return best
-    return replace(best, factor=1.0, unit=unit)
+    ratio = best.factor * POSE_UNITS.get(best.unit, 1.0)
+    ranges = [np.linalg.norm(view.points, axis=1) for view in sample.views.values()]
+    median = float(np.median(np.concatenate(ranges)))
+    least, most = PLAUSIBLE_MEDIAN_M
+    known = set(UNITS.values()) - {UNITS[1.0]}
+
+    def unlikely(reading: Reading) -> tuple[bool, bool, int]:
+        other = reading.factor != 1.0
+        return (
+            not least <= median * reading.factor <= most,
+            other and _unit_of_depth(steps / reading.factor) not in known,
+            other + (reading.unit != given.unit),
+        )
+
+    units = {"": 1.0, **POSE_UNITS}.items()
+    ways = [replace(best, factor=float(np.round(ratio / per_m, 12)), unit=unit) for unit, per_m in units]
+    return min(ways, key=unlikely)
 
 
 def _unit_of_depth(steps: float) -> str:

@@ -11,6 +11,7 @@ UNITS = {
     1000.0: "millimetres",
     5000.0: "TUM RGB-D's, ICL-NUIM's",
     4000.0: "RealSense's and ScanNet's finer one",
+    6553.5: "Replica's",
     10000.0: "tenths of a millimetre",
     256.0: "KITTI's",
     100.0: "centimetres",

@@ -23,6 +23,10 @@ EXPLAINED = 0.03
 FEWEST_PAIRS = 3
 """Fewer pairs of frames do not tell a reading from another."""
 
+SEEN_THROUGH = 0.15
+"""Share of the points seen again that lie in front of what is measured there, of the middle one of all
+pairs, up to which frames need not contradict each other: clean recordings have .05 at most."""
+
 QUESTIONS = {
     "inverse": "the direction of poses",
     "w_first": "the order of quaternions",
@@ -38,6 +42,7 @@ _WORST = 0.2
 _EXPLAINING = 0.5
 _NOISE = 0.002
 _BETTER, _AS_WELL = 2.0, 1.3
+_SEEN_AGAIN, _NEARER = 0.3, 0.95
 _ROUNDS = 3
 _FEW, _MANY = 2, 8
 _LATE_STEPS_S = (0.05, 0.01)
@@ -58,9 +63,10 @@ class Search:
     def __init__(self, sample: Sample, given: Reading, steps_per_metre: float) -> None:
         """``steps_per_metre`` is the unit of the depth images as they are read."""
         self.sample, self.given = sample, given
-        # Depths in another unit than poses are depths that are multiplied (Reading.with_unit_of_poses).
-        of_poses = [1 / POSE_UNITS[given.unit]] if given.unit else POSE_UNITS.values()
-        factors = np.array([*(steps_per_metre / steps for steps in UNITS), *of_poses])
+        # Poses in another unit are depths that are multiplied (diagnosis.py, _with_likeliest_units).
+        of_poses = np.array([1.0, *POSE_UNITS.values()]) / POSE_UNITS.get(given.unit, 1.0)
+        of_depth = [1.0, *(steps_per_metre / steps for steps in UNITS)]
+        factors = np.outer(of_depth, of_poses).ravel()
         self._units = [float(each) for each in np.unique(factors.round(12)) if not np.isclose(each, 1.0)]
         self._known: dict[Reading, Floats] = {}
         self._mended: dict[Reading, Floats] = {}
@@ -130,6 +136,21 @@ class Search:
         # Of late poses some pairs are not known. What they lack is made up for, so that scores compare.
         whole = self.differences(replace(reading, late_s=0.0)) + _NOISE
         return float(found[told].mean() * whole[usable].mean() / whole[told].mean())
+
+    def seen_through(self, reading: Reading) -> float:
+        """The share of the points seen again that the other frame saw through, of the middle one of the pairs
+        with enough of them; 0 if they are too few. What frames with little in common never tell from depths
+        that differ, this does: nothing hides what lies in front."""
+        points, shares = self._points(reading), []
+        for (first, second), T in zip(self.sample.pairs, self.moves(reading), strict=True):
+            for one, other, move in ((first, second, T), (second, first, None if T is None else inverse(T))):
+                if move is None:
+                    continue
+                seen = seen_by(self.sample.views[other], points[one], move, reading)
+                there = seen.measured > 0
+                if there.mean() > _SEEN_AGAIN:
+                    shares.append(float((seen.expected[there] < _NEARER * seen.measured[there]).mean()))
+        return float(np.median(shares)) if len(shares) >= FEWEST_PAIRS else 0.0
 
     def clearly_better(self, one: Reading, other: Reading) -> bool:
         """True if frames explain each other with the one, and differ by more than twice as much with the

@@ -8,12 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from taichi_mrf.calibration.from_recording import LearntSigma, is_default_noise
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
+from taichi_mrf.datasets.recorded_noise import some_depths
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.free_space import calibrate_free, spread_frames
@@ -127,13 +130,15 @@ def write_run(
     pictures: bool = True,
     haste: Haste = NO_HASTE,
     advance: Advance = lambda stage, done, total: None,
+    mistakes_of: Callable[[Dataset], list[str]] = mistakes,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
     with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
     an earlier run are removed.
 
-    Returns the report and the paths. Raises MapFileError.
+    Returns the report and the paths; ``refused`` in the report is why the map is not to be used, of which
+    ``mistakes_of`` the recording say what mends it. Raises MapFileError.
     """
     posed = facts.dataset
     if posed is not None and result.track is not None:
@@ -162,13 +167,16 @@ def write_run(
     unanswered = 0.0 if found is None else found.error.unanswered
     if posed is not None and (contradicts(noise) or unanswered > _MOST_UNANSWERED) and not haste.hurried:
         with result.timed("checking"):
-            seen = mistakes(posed)
+            seen = mistakes_of(posed)
     report = facts.report(result, found, noise, seen)
     if seen and not contradicts(noise):
         share = f"{unanswered:.0%} of the held-out pixels have no answer in the map"
         report["notes"].append(f"{share}: {'; '.join(seen)}.")
     if not occupied:
-        report["notes"].append(_nothing_occupied(facts.config))
+        report["refused"] = _nothing_occupied(facts.config, posed)
+        report["notes"].append(report["refused"])
+    elif contradicts(noise) or seen:
+        report["refused"] = next(note for note in reversed(report["notes"]) if "held-out" in note)
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
@@ -205,9 +213,20 @@ def write_mesh_file(path: Path, m: OccupancyMap) -> str:
     return export_note(m, path, options) or ""
 
 
-def _nothing_occupied(config: Config) -> str:
-    advice = METHODS[config.method].if_empty or "check the depth scale, the voxel size and the sensor's range"
-    return f"The map is empty: no voxel has a probability of 0.5 or more; {advice}."
+def _nothing_occupied(config: Config, dataset: Dataset | None) -> str:
+    """Why no voxel is occupied, in words."""
+    depths_m = np.ones(1, np.float32) if dataset is None else some_depths(dataset)
+    median_m = float(np.median(depths_m)) if len(depths_m) else 0.0
+    reach_m = config.sensor.max_depth
+    if not len(depths_m):
+        why = "the frames that were looked at have no measured depth"
+    elif median_m < config.voxel_size:
+        why = f"the median depth is {median_m:.2g} m, less than a voxel: check --depth-scale"
+    elif median_m > reach_m:
+        why = f"the median depth is {median_m:.3g} m, beyond sensor.max_depth, {reach_m:g} m"
+    else:
+        why = METHODS[config.method].if_empty or "no frame confirms what another one saw: check the poses"
+    return f"The map is empty: no voxel has a probability of 0.5 or more; {why}."
 
 
 def _write_map(

@@ -24,7 +24,7 @@ def run_report(
 ) -> dict[str, Any]:
     """The facts of a run as plain values, lengths in metres. ``dataset`` is None for a saved map that was
     opened again; ``accuracy`` is None unless held-out frames were compared, ``did_not_fit`` unless memory
-    ran out."""
+    ran out, ``refused`` unless the recording contradicts the map (folder.py)."""
     statistics = result.map.statistics()
     choice = runtime.choice()
     return {
@@ -36,6 +36,7 @@ def run_report(
         "device": choice.device if choice else None,
         "interrupted": result.interrupted or result.full is not None,
         "did_not_fit": result.full,
+        "refused": None,
         "frames": result.frames,
         "keyframes": len(result.map.keyframes),
         "frozen": statistics.frozen,

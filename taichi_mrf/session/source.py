@@ -17,7 +17,7 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import format_name, recognise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import note_unused_color
-from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
+from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance, mistakes
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.mapping.tracking import wants_color
@@ -192,7 +192,7 @@ def open_source(
     if not config.color and METHODS[config.method].has_colors:
         note_unused_color(dataset, name, reading or SourceFlags())
     config = with_recorded_noise(config, dataset)
-    found = mistakes_at_a_glance(dataset)
+    found = mistakes(dataset) if doubtful_at_a_glance(dataset) else []
     dataset.notes += [f"frames contradict each other: {'; '.join(found)}"] if found else []
     learnt = None if learn_noise is None else learn_noise(dataset, config)
     if learnt is not None:

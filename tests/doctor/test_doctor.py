@@ -1,6 +1,7 @@
 """The usual mistakes of conventions are found, and nothing in what is as it should be."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -20,9 +21,9 @@ from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes, mistakes_at_a_glance
+from taichi_mrf.doctor.diagnosis import Diagnosis, Finding, diagnose, doubtful_at_a_glance, mistakes
 from taichi_mrf.doctor.picture import overlap
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, ReadWrongError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.source import open_source
@@ -147,9 +148,10 @@ def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
     (finding,) = diagnose(of_frames(room), Conventions(unit="mm")).findings
     assert (finding.text, finding.flag) == ("poses are in metres", "--poses-are ''")
     both = [replace(f, depth_m=np.rint(1000 * f.depth_m) / np.float32(5000)) for f in in_millimetres(room)]
-    (finding,) = diagnose(of_frames(both)).findings
-    assert finding.text.startswith("poses and depths are in one unit, and that is not metres")
-    assert finding.flag == "--depth-scale 1000"
+    assert [finding.flag for finding in diagnose(of_frames(both)).findings] == [
+        "--poses-are mm",
+        "--depth-scale 1000",
+    ]
 
 
 def test_a_sensor_that_moves_farther_than_it_sees_is_a_note(room: list[Frame], tmp_path: Path) -> None:
@@ -246,10 +248,14 @@ def test_map_names_the_mistake_and_learns_no_noise_from_it(
     folder = write_tum(tmp_path / "mine", broken(room, "inverse"))
     out = tmp_path / "out"
     coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--noise", noise, "--quiet")
-    assert carry_out("map", folder, "--out", out, *coarse) == 0
+    command = f"taichi-mrf map {folder} --depth-scale=1000.0 --poses-are inverse --out DIR"
+    with pytest.raises(ReadWrongError, match=re.escape(f"poses are T_camera_world: {command}; --force")):
+        carry_out("map", folder, "--out", out, *coarse)
+    assert not (out / "map.npz").exists()
+    assert carry_out("map", folder, "--out", out, *coarse, "--force") == 0
     report = json.loads((out / "report.json").read_text())
     (note,) = [note for note in report["notes"] if "contradict" in note]
-    assert note.endswith("poses are T_camera_world (--poses-are inverse mends it).")
+    assert note.endswith(f"poses are T_camera_world: {command}.")
     assert report["noise"]["learnt"] is None
     assert "--noise auto" not in " ".join(report["notes"])
 
@@ -267,7 +273,7 @@ def test_map_says_the_words_of_a_pose_file_as_they_ought_to_be_written(
 
 
 def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp_path: Path) -> None:
-    assert mistakes_at_a_glance(of_frames(room)) == []
+    assert not doubtful_at_a_glance(of_frames(room))
     folder = write_tum(tmp_path / "mine", broken(room, "opengl"))
     reading = SourceFlags(depth_scale=1000)
     _, notes = open_source(str(folder), Config(), every=1, limit=None, speed=1.0, loop=False, reading=reading)
@@ -280,7 +286,67 @@ def test_map_names_the_mistake_where_it_answers_hardly_any_pixel(room: list[Fram
     """Tenths of millimetres, which are read as millimetres, put all surfaces beyond the sensor's range."""
     folder = write_tum(tmp_path / "mine", [replace(f, depth_m=10 * f.depth_m) for f in room])
     coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--quiet", "--sensor.max-depth", 9)
-    assert carry_out("map", folder, "--out", tmp_path / "out", *coarse) == 0
+    assert carry_out("map", folder, "--out", tmp_path / "out", *coarse, "--force") == 0
     report = json.loads((tmp_path / "out/report.json").read_text())
     (note,) = [note for note in report["notes"] if "held-out pixels have no answer" in note]
-    assert note.endswith("not 1000 (--depth-scale 10000 mends it).")
+    assert note.endswith(f"not 1000: taichi-mrf map {folder} --depth-scale 10000 --out DIR.")
+
+
+def write_numbered(folder: Path, frames: Sequence[Frame], steps: float = 1000, unit: int = 1) -> Path:
+    """Depth images and poses without a word on their units."""
+    for i, frame in enumerate(frames):
+        write_image(folder / f"depth/{i:04d}.png", np.rint(steps * frame.depth_m).astype(np.uint16))
+    k = frames[0].camera
+    np.savetxt(folder / "K.txt", [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    rows = [np.diag([1, 1, 1, unit]) @ f.T_world_camera[:3].T for f in frames]
+    np.savetxt(folder / "poses.txt", [row.T.ravel() for row in rows])
+    return folder
+
+
+@pytest.mark.parametrize("flags", [(), ("--depth-scale", "1000")])
+def test_two_units_are_one_search_and_the_command_reads_both(
+    room: list[Frame], flags: tuple[str, ...], tmp_path: Path
+) -> None:
+    folder = write_numbered(tmp_path / "mine", room, unit=1000)
+    with pytest.raises(ReadWrongError) as refused:
+        carry_out("map", folder, *flags, "--out", tmp_path / "out", "--quiet")
+    words = str(refused.value).split("taichi-mrf map ")[1].split(" --out DIR")[0]
+    assert sorted(words.replace("=", " ").replace("1000.0", "1000").split()[1:]) == sorted(
+        ["--poses-are", "mm", "--depth-scale", "1000"]
+    )
+    found = open_dataset(folder, poses_are="mm", depth_scale=1000, color=False)
+    np.testing.assert_allclose(found.read(3).depth_m, room[3].depth_m, atol=6e-4)
+    np.testing.assert_allclose(found.pose(3), room[3].T_world_camera, atol=1e-6)
+
+
+def test_the_unit_of_depth_is_sought_at_poses_in_the_unit_that_is_said(
+    room: list[Frame], tmp_path: Path
+) -> None:
+    dataset = open_dataset(write_numbered(tmp_path / "mine", room, unit=1000), poses_are="mm", color=False)
+    np.testing.assert_allclose(dataset.read(3).depth_m, room[3].depth_m, atol=6e-4)
+
+
+def test_the_unit_of_depth_is_sought_at_the_poses_of_a_file_too(room: list[Frame], tmp_path: Path) -> None:
+    folder, lines = write_numbered(tmp_path / "mine", room), tmp_path / "poses.txt"
+    (folder / "poses.txt").rename(lines)
+    dataset = open_posed(folder, lines, color=False)
+    np.testing.assert_allclose(dataset.read(3).depth_m, room[3].depth_m, atol=6e-4)
+    (note,) = [note for note in dataset.notes if "steps per metre" in note]
+    assert note.startswith("depth: 1000 steps per metre, found by comparing")
+
+
+@pytest.mark.parametrize("steps", [4000, 6553.5])
+def test_a_scale_that_few_use_is_found(room: list[Frame], steps: float, tmp_path: Path) -> None:
+    (finding,) = diagnose(open_dataset(write_numbered(tmp_path / "mine", room, steps=steps))).findings
+    assert finding.flag == f"--depth-scale {steps:g}"
+
+
+def test_a_command_that_does_not_mend_a_recording_is_not_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = Diagnosis((Finding("poses are in centimetres", "--poses-are cm"),), before=0.2, after=0.001)
+    monkeypatch.setattr("taichi_mrf.doctor.remedy.diagnose", lambda *each: wrong)
+    assert carry_out("doctor", write_numbered(tmp_path / "mine", rendered()[:4])) == 4
+    said = capsys.readouterr().out
+    assert "--poses-are cm" not in said
+    assert "none of the usual mistakes explains" in said

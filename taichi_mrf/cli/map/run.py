@@ -29,7 +29,7 @@ from taichi_mrf.cli.map.summary import (
 from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
-from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.output import DID_NOT_FIT, READ_WRONG, output_folder
 from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
@@ -44,6 +44,7 @@ from taichi_mrf.system.atomic import write_text
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
+KEPT = "The files are kept; --force ends without this error."
 LIVE_VIEW = "shows the map in the browser."
 
 
@@ -78,6 +79,9 @@ def _map_here(options: Map, console: Terminal, request: StopRequest) -> int:
     with ProgressBar(console, options.printing) as progress:
         report, written = map_to_folder(task, progress, request)
     print_run(console, options, report, written)
+    if not request() and report["refused"] and not options.force:
+        print_problem(f"{report['refused']} {KEPT}")
+        return READ_WRONG
     if request() or report["did_not_fit"] is None:
         return request.exit_status
     saved = f"the map of {report['keyframes']} keyframes was saved to {options.out}"
@@ -121,6 +125,10 @@ def _map_in_processes(options: Map, console: Terminal, request: StopRequest) -> 
     failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
     if request() or not failed:
         return request.exit_status
+    if single and failed[0].status == "refused":
+        kept = f" {KEPT}" if batch.outcomes[0].report else ""
+        print_problem(f"{failed[0].error}{kept}")
+        return READ_WRONG
     if single and _did_not_fit(batch.outcomes.get(0)):  # the report says so
         return DID_NOT_FIT
     problem = failed[0].error or failed[0].status
@@ -220,6 +228,8 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
     if options.json:
         print(report_json(report), end="")
         return
+    if not options.force:  # it is the error that the command ends with
+        report = {**report, "notes": [note for note in report["notes"] if note != report["refused"]]}
     print_report(console, report, written)
     look = LOOK_AT_PICTURES if any(path.suffix == ".png" for path in written) else "Open"
     live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"

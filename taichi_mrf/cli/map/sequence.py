@@ -5,6 +5,7 @@ import os
 import time
 import traceback
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,8 +22,9 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.summary import note_unused_color
-from taichi_mrf.doctor.diagnosis import mistakes
-from taichi_mrf.errors import TaichiMRFError, collected_warnings
+from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
+from taichi_mrf.doctor.remedy import remedy
+from taichi_mrf.errors import DatasetError, ReadWrongError, TaichiMRFError, collected_warnings
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
@@ -35,7 +37,7 @@ from taichi_mrf.system import runtime
 _PATIENCE_S = 20.0
 """How long to wait for the folder: the process that a lost worker has left may still hold it for a moment."""
 
-Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
+Status = Literal["mapped", "finished before", "stopped", "failed", "refused", "not done"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ def map_to_folder(
     if not settings.color and METHODS[settings.method].has_colors:
         note_unused_color(dataset, task.source, task.options.reading)
     settings = with_recorded_noise(settings, dataset)
+    if not task.options.force:
+        _refuse_what_is_read_wrong(task, dataset)
     previous = resumed_map(task.out, settings) if task.options.resume else None
     skipped = skipped_before(task.out) if task.options.resume else {}
     opening = time.perf_counter() - start
@@ -90,7 +94,7 @@ def map_to_folder(
         result.seconds = {"opening": opening, **learning, **result.seconds}
         return write_run(
             task.out, result, facts, pictures=task.options.pictures,
-            haste=request, advance=progress.advance,
+            haste=request, advance=progress.advance, mistakes_of=partial(_mistakes, task),
         )  # fmt: skip
 
 
@@ -109,10 +113,30 @@ def _learn_noise(
             dataset, settings, every=task.options.every, limit=task.options.limit, should_stop=request
         )
     # No noise is learnt from a recording that is not what it is taken for. The check of the map says so, too.
-    found = mistakes(dataset) if contradicts(learnt) else []
+    found = _mistakes(task, dataset) if contradicts(learnt) else []
+    if found and not task.options.force:
+        raise ReadWrongError(f"{task.source}: {'; '.join(found)}; --force maps it as it is read")
     if found and not settings.evaluation.hold_out:
         dataset.notes.append(f"frames contradict each other: {'; '.join(found)}")
     return None if found else learnt
+
+
+def _refuse_what_is_read_wrong(task: MapTask, dataset: Dataset) -> None:
+    """Raise ReadWrongError for a recording whose frames explain each other in another reading only."""
+    if task.options.poses.follow or not doubtful_at_a_glance(dataset):
+        return
+    found = _mistakes(task, dataset)
+    if found:
+        raise ReadWrongError(f"{task.source}: {'; '.join(found)}; --force maps it as it is read")
+
+
+def _mistakes(task: MapTask, dataset: Dataset) -> list[str]:
+    """What is odd in a task's recording, with the command that mends it."""
+    try:
+        found = remedy(task.source, task.options.poses.file, task.options.reading)
+    except DatasetError:  # such as a recording without poses
+        return []
+    return [found.in_words()] if found.found.findings else []
 
 
 def listener_of(progress: ProgressBar) -> Listener:
@@ -147,9 +171,12 @@ def map_in_process(task: MapTask) -> Outcome:
                 map_to_folder(task, silent, request)
                 report = report_in(task.out)
         except Exception as error:
-            return Outcome("stopped") if request() else Outcome("failed", error=_one_line(error))
+            status: Status = "refused" if isinstance(error, ReadWrongError) else "failed"
+            return Outcome("stopped") if request() else Outcome(status, error=_one_line(error))
     if report and report.get("did_not_fit"):
         return Outcome("failed", report, report["did_not_fit"])
+    if report and report.get("refused") and not task.options.force:
+        return Outcome("refused", report, report["refused"])
     return Outcome("stopped" if report and report["interrupted"] else "mapped", report)
 
 

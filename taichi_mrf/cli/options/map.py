@@ -51,6 +51,10 @@ class Map:
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace the run that DIR holds. Without it, a run of other parameters is refused."""
 
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Map a recording that is surely not read as it was written, and keep a map that its held-out frames
+    contradict. Without it, both end with status 4, and so does an empty map."""
+
     keep_every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 30.0
     """Seconds between crash checkpoints; stretched automatically so that saving takes at most 5% of the
     run."""

@@ -8,7 +8,7 @@ before. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be le
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
@@ -61,7 +61,7 @@ class FramesNpz(Table[NpzFrame]):
     scale_given: bool = False
     _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
 
-    def check_scale(self, poses_are_used: bool) -> list[str]:
+    def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
         """A note of whole numbers that are no measurements; the unit is known."""
         try:
             depth, _ = self._images(self.rows[0].part)

@@ -29,7 +29,7 @@ import struct
 import weakref
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -363,7 +363,7 @@ class RtabmapRecording(Table[PosedNode]):
     steps_per_metre: float = STEPS_PER_METRE
     color: bool = True
 
-    def check_scale(self, poses_are_used: bool) -> list[str]:
+    def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
         """A note of whole numbers that are no measurements; the unit is known."""
         shares = []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from taichi_mrf.config.arguments import real
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
-from taichi_mrf.datasets.derived import Chosen, moved_note, origin_of, pose_of, stated_origin
+from taichi_mrf.datasets.derived import Chosen, Derived, moved_note, origin_of, pose_of, stated_origin
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile, open_pose_source
+from taichi_mrf.datasets.recording import Recording
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, check_unit
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, collected_warnings, naming
@@ -329,7 +330,7 @@ def open_posed(
         if follow:
             raise DatasetError(f"--follow needs poses from the start: {problem}") from problem
         dataset.tracked = has_poses = False
-    return posed_by(
+    posed = posed_by(
         dataset,
         opened,
         follow=follow,
@@ -337,3 +338,24 @@ def open_posed(
         has_poses=has_poses,
         conventions=conventions,
     )
+    if not (has_poses or follow):
+        _check_scale(posed)
+    return posed
+
+
+def _check_scale(posed: PosedFrames) -> None:
+    """Check the unit of depth again, at the poses that the frames of a recording without any now have."""
+    source = posed.source
+    while isinstance(source, Derived):
+        source = source.source
+    if not isinstance(source, Recording) or len(source) != len(posed.source):
+        return
+    place = {kept: index for index, kept in enumerate(posed.indices)}
+
+    def pose(index: int) -> Pose:
+        if index not in place:
+            raise FrameError(f"{source.frame_names[index]}: has no pose")
+        return posed.pose(place[index])
+
+    before = source.scale_notes
+    posed.notes = [note for note in posed.notes if note not in before] + source.check_scale(pose)

@@ -11,7 +11,7 @@ choose them.
 """
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -104,7 +104,7 @@ class RosBag(Table[BagRow]):
     gyro: GyroSamples | None = None
     acceleration: AccelerationSamples | None = None
 
-    def check_scale(self, poses_are_used: bool) -> list[str]:
+    def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
         """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
         metres."""
         shares, depths = [], []

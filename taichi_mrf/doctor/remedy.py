@@ -1,0 +1,87 @@
+"""The command that reads a recording as it was written: opened with the flags that were found, and compared
+once more, before anybody is told of it."""
+
+import shlex
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.conventions import AXIAL, conventions_of
+from taichi_mrf.datasets.pose_sources.posed import open_posed
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, unexplained
+from taichi_mrf.errors import ConfigError, DatasetError
+
+_ROUNDS = 3
+"""How often what is read with the flags that were found is looked at for further ones."""
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What is odd in a recording; ``command`` reads it as it was written, empty if nothing is known to."""
+
+    found: Diagnosis
+    command: str = ""
+
+    def in_words(self) -> str:
+        """What was found and what to do, in one line."""
+        texts = "; ".join(each.text for each in self.found.findings)
+        return f"{texts}: {self.command}" if self.command else texts
+
+
+def remedy(source: str, poses: str | Path | None, reading: SourceFlags) -> Remedy:
+    """Look for what is odd in a source, as it is read with these flags and at these poses, and for the
+    command that mends it. Raises DatasetError as :func:`diagnose` does."""
+    found = _diagnose_as_written(source, poses, reading)
+    merged, flags, latest = dict[str, str](), reading, found
+    findings = []
+    for _ in range(_ROUNDS):
+        new = [each for each in latest.findings if each.flag]
+        if not new or len(new) < len(latest.findings):
+            break
+        merged |= {each.flag.split(" ", 1)[0]: each.flag for each in new}
+        findings += new
+        flags = _with_flags(reading, list(merged.values()))
+        try:
+            mended = open_posed(source, poses, color=False, **flags.keywords())
+            latest = diagnose(mended)
+        except (DatasetError, ConfigError):
+            return Remedy(unexplained(found))
+    if not merged:
+        return Remedy(found)
+    if latest.findings or latest.before is None or latest.contradicted:
+        return Remedy(unexplained(found))
+    last = {each.flag.split(" ", 1)[0]: each for each in findings}
+    kept = [each for each in findings if each.flag == last[each.flag.split(" ", 1)[0]].flag]
+    names = set(merged)
+    words = [word for word in reading.words() if word.split("=")[0] not in names]
+    words += [f"--poses={poses}"] if poses else []
+    command = " ".join(
+        [shlex.join(["taichi-mrf", "map", source, *words]), *dict.fromkeys(merged.values()), "--out DIR"]
+    )
+    return Remedy(replace(found, findings=tuple(kept), after=latest.before), command)
+
+
+def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceFlags) -> Diagnosis:
+    """Diagnosis of a source with the conventions of the flags not undone, so that they may be found wrong."""
+    keywords = reading.keywords()
+    said = conventions_of(keywords["poses_are"], keywords["mounting"], keywords["depth_is"])
+    as_written = {**keywords, "poses_are": None, "mounting": None, "depth_is": AXIAL}
+    dataset: Dataset
+    try:
+        dataset = open_posed(source, poses, color=False, **as_written)
+    except DatasetError:  # such as scans that are only read with the flag that their poses want
+        if as_written == keywords:
+            raise
+        dataset = open_posed(source, poses, color=False, **keywords)
+    return diagnose(dataset, said)
+
+
+def _with_flags(reading: SourceFlags, flags: list[str]) -> SourceFlags:
+    """The flags of a source with others, as they are typed, in place of some."""
+    changed: dict[str, float | str | None] = {}
+    for flag in flags:
+        name, value = shlex.split(flag)
+        field = name.removeprefix("--").replace("-", "_")
+        changed[field] = float(value) if field == "depth_scale" else value or None
+    return replace(reading, **changed)  # type: ignore[arg-type]
