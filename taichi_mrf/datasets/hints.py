@@ -114,11 +114,11 @@ def hint_for(path: Path) -> str | None:
     kinds = {kind for child in children if (kind := _kind(child))}
     below = [file for child in sorted(path.iterdir()) if is_folder(child) for file in _first_files(child)]
     images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
-    if len(kinds) == 1 and not (images and _POSES_ONLY in next(iter(kinds))):
-        return kinds.pop()
     unread = [
         file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in (".exr", ".npy", ".pfm")
     ]
+    if len(kinds) == 1 and not ((images or unread) and _POSES_ONLY in next(iter(kinds))):
+        return kinds.pop()
     if unread:
         return _kind(unread[0])
     return image_hint(images, "holds images") if images else None

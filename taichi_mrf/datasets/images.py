@@ -149,11 +149,9 @@ def read_depth(
     of another size than the camera's.
     """
     steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
-    if steps.ndim == 2 and steps.dtype.kind == "f":
-        steps = np.where(np.isfinite(steps) & (steps > 0), steps, 0)
-    else:
+    if not (steps.ndim == 2 and steps.dtype.kind == "f"):
         steps = _of_16_bit(steps, str(path))
-    return steps.astype(np.float32) / np.float32(steps_per_metre)
+    return without_filling(steps.astype(np.float32) / np.float32(steps_per_metre))
 
 
 def holds_depth(path: Path) -> bool:
@@ -194,6 +192,21 @@ def measured(steps: NDArray[Kind]) -> NDArray[Kind]:
     return np.where(steps == np.iinfo(steps.dtype).max, steps.dtype.type(0), steps)
 
 
+_NOT_SEEN_M = 1e7
+"""No camera's depth is as large, in whatever unit: renderers write 1e10 where there is no surface."""
+
+_LARGEST_MM_M = 65.535
+"""The largest number of 16 bits, once millimetres have become metres."""
+
+
+def without_filling(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth (H, W) with 0 where it is no number, negative, or what is written for no measurement."""
+    none = ~(np.isfinite(depth) & (depth > 0) & (depth < _NOT_SEEN_M))
+    none |= np.abs(depth - np.float32(_LARGEST_MM_M)) < 1e-5
+    depth[none] = 0.0
+    return depth
+
+
 def read_color(path: Path, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
     """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file, also for one of another
     size than the camera's."""
@@ -230,7 +243,11 @@ def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
             f"{where}: not a depth image: expected 16-bit grey, "
             f"found {8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
             + (
-                "; a picture of depth in colours or 8 bits has lost the measurements"
+                "; a picture of depth in colours or 8 bits has lost the measurements, but for a simulator's, "
+                "whose colours are bytes of one number (CARLA: 1000 m * (R + 256 G + 65536 B) / (2^24 - 1)): "
+                "compute depth, and write it as 16-bit millimetres"
+                if image.itemsize == 1 and channels > 2
+                else "; a picture of depth in 8 bits has lost the measurements"
                 if image.itemsize == 1
                 else ""
             )

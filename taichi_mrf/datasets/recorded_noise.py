@@ -31,6 +31,12 @@ SHORT_RAYS_FLOOR = 0.01
 """Density of outliers, per metre, where rays are short. The prior is less sure than this of what ends a long
 one, so that those would be taken for outliers."""
 
+FARTHEST_M = 10_000.0
+"""No measurement is farther; what claims to be gets no range of its own."""
+
+FILLED, FARTHEST_OTHER = 0.03, 0.9
+"""A number that so many measurements are, and all others are at most so much of it, may be no measurement."""
+
 LOOKED_AT = 3
 """Frames whose depths are looked at: the first, the middle and the last one."""
 
@@ -89,6 +95,7 @@ def _with_reach(settings: Config, dataset: Dataset) -> Config:
     if own is not None and not given:
         return _reaching(settings, dataset, own, "as far as the first scan reaches")
     depths_m = some_depths(dataset)
+    dataset.notes += _note_of_filling(depths_m)
     beyond = float((depths_m > sensor.max_depth).mean()) if depths_m.size else 0.0
     useful = _useful_depth(sensor, depths_m)
     if beyond <= MUCH or useful == sensor.max_depth:
@@ -123,11 +130,25 @@ def some_depths(dataset: Dataset) -> NDArray[np.float32]:
     return np.concatenate(depths)
 
 
+def _note_of_filling(depths_m: NDArray[np.float32]) -> list[str]:
+    """A note, if many measurements are one number that is far larger than all others."""
+    if not depths_m.size:
+        return []
+    largest, others = float(depths_m.max()), depths_m[depths_m < depths_m.max()]
+    share = 1 - len(others) / len(depths_m)
+    if share < FILLED or not len(others) or others.max() > FARTHEST_OTHER * largest:
+        return []
+    return [
+        f"depth: {share:.0%} of the measurements are exactly {largest:g} m, and no other is farther than "
+        f"{others.max():.3g} m: if that stands for what was not seen, write 0 in its place"
+    ]
+
+
 def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
     """Depth, in whole metres and no less than the default, at which measurements end but for a hundredth, or
     sigma gets too large."""
     least = SensorConfig().max_depth
-    most = float(np.quantile(depths_m, 0.99)) if depths_m.size else least
+    most = min(float(np.quantile(depths_m, 0.99)), FARTHEST_M) if depths_m.size else least
     tried = np.arange(least, max(most, least) + 0.5, 0.5)
     sigma = np.median(evaluate(patch_coefficients(sensor)[0][:, None], tried), axis=0)
     worse = np.flatnonzero(sigma > USEFUL * tried)

@@ -171,7 +171,11 @@ def test_a_recording_at_an_ordinary_rate_gives_a_visibility_map_and_an_empty_map
     visibility = (ROOM, "--method", "visibility", "--limit", "6", *FAST)
     assert "map is empty" not in mapped(*visibility, "--out", tmp_path / "full")
     assert len(load_map(tmp_path / "full" / "map.npz").voxels(min_probability=0.5)[0]) > 200
-    printed = mapped(*visibility, "--sensor.max-depth", "0.2", "--out", tmp_path / "empty")
-    assert "Note: The map is empty" in printed
-    assert "map more frames" in " ".join(printed.split())
-    assert any("map is empty" in note for note in report_of(tmp_path / "empty")["notes"])
+    done = taichi_mrf("map", *visibility, "--sensor.max-depth", "0.2", "--out", tmp_path / "empty")
+    assert done.returncode == 4
+    assert "Note: The map is empty" not in done.stdout
+    assert "m, beyond sensor.max_depth, 0.2 m. The files are kept" in " ".join(done.stderr.split())
+    assert "map is empty" in report_of(tmp_path / "empty")["refused"]
+    assert "Note: The map is empty" in mapped(
+        *visibility, "--sensor.max-depth", "0.2", "--out", tmp_path / "forced", "--force"
+    )

@@ -44,6 +44,8 @@ def test_sources_without_a_recording(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     (tmp_path / "depth" / "0.exr").write_bytes(b"something")
     refused(tmp_path, "not read (0.exr)")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    refused(tmp_path, "not read (0.exr); write them as an .npz with depth_m")
 
 
 UNREAD = {

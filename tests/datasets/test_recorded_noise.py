@@ -94,3 +94,28 @@ def test_outliers_are_dense_only_where_rays_are_short() -> None:
     stated = replace(Config(), inference=InferenceConfig(outlier_floor=1e-4))
     assert with_recorded_noise(stated, room).inference == stated.inference
     assert with_tuned_noise(Config(), hall).inference.outlier_floor == LEAST_FLOOR
+
+
+@pytest.mark.parametrize("filling_m", [1e10, 65.535, 10.0])
+def test_a_number_for_what_was_not_seen_is_no_measurement_or_is_said(
+    filling_m: float, tmp_path: Path
+) -> None:
+    true_m = np.random.default_rng(0).uniform(1, 4, (4, 12, 16)).astype(np.float32)
+    depth_m = true_m.copy()
+    depth_m[:, :3] = filling_m
+    camera = {"K": np.array([[14.0, 0, 7.5], [0, 14, 5.5], [0, 0, 1]])}
+    np.savez(tmp_path / "walk.npz", depth_m=depth_m, T_world_camera=np.stack([np.eye(4)] * 4), **camera)
+    dataset = open_dataset(tmp_path / "walk.npz")
+    read_m = dataset.read(1).depth_m
+    np.testing.assert_array_equal(read_m[3:], true_m[1, 3:])
+    np.testing.assert_array_equal(read_m[:3], filling_m if filling_m == 10 else 0)
+    settings = with_recorded_noise(Config(), dataset)
+    assert settings.sensor.max_depth <= 10
+    told = [note for note in dataset.notes if "exactly 10 m" in note]
+    assert len(told) == (filling_m == 10)
+    assert not told or told[0].startswith("depth: 25% of the measurements")
+
+
+def test_no_range_is_sought_without_bound() -> None:
+    endless_m = Street("street", CAMERA, far_m=1e10)
+    assert with_recorded_noise(Config(), endless_m).sensor.max_depth < 10_000

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Row, Table, start_pose
 from taichi_mrf.datasets.depth_scale import check_metres
-from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest
+from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest, without_filling
 from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -77,7 +77,7 @@ class FramesNpz(Table[NpzFrame]):
         (depth, color), part, i = self._images(row.part), row.part, row.number
         values = measured(depth[i]) if depth.dtype.kind == "u" else depth[i]
         depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)
-        depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
+        depth_m = without_filling(depth_m)
         image = None if color is None else color[i]
         camera = part.cameras[i] if self.own else self.camera
         return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, image)

@@ -18,6 +18,7 @@ from taichi_mrf.datasets.images import (
     decode_rvl,
     measured,
     share_of_largest,
+    without_filling,
 )
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError
@@ -107,8 +108,7 @@ def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
     values, steps = _compressed(message) if hasattr(message, "format") else _raw(message)
     values = measured(values) if values.dtype.kind in "ui" else values
     depth_m = values.astype(np.float32) / np.float32(depth_scale or steps)
-    depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
-    return depth_m
+    return without_filling(depth_m)
 
 
 def share_without(message: Any) -> float:
