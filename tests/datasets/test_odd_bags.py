@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import bag_clouds
@@ -37,7 +38,10 @@ from inputs_bags import (
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.ros.sensor import camera_of
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
 
 T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -345,3 +349,17 @@ def test_a_folder_of_bags_names_them(make: Make, tmp_path: Path) -> None:
     make(plain)
     make(plain, kind="mcap", name="second")
     assert refused(tmp_path).endswith("pass one of: second, walk.bag")
+
+
+def test_an_identity_for_a_calibration_gives_way_to_the_projection() -> None:
+    P = np.array([[62.0, 0, 39.5, 0], [0, 62, 29.5, 0], [0, 0, 1, 0]])
+    roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
+    info = SimpleNamespace(
+        k=np.eye(3).ravel(), d=np.zeros(5), p=P.ravel(), width=80, height=60, roi=roi,
+        binning_x=0, binning_y=0, distortion_model="plumb_bob",
+    )  # fmt: skip
+    camera, distortion = camera_of(info, rectified=False)
+    assert (camera.full, distortion) == (PinholeCamera(80, 60, 62, 62, 39.5, 29.5), ())
+    info.p = np.zeros(12)
+    with pytest.raises(DatasetError, match=r"not calibrated .a focal length of 1 pixels.; pass --camera"):
+        camera_of(info, rectified=False)

@@ -298,9 +298,15 @@ def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ..
     OpenCV's.
     """
     K, D, P = (_field(info, name) for name in "kdp")
-    matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
-    if matrix[0, 0] == 0:
-        raise DatasetError("is not calibrated (K is zero); pass --camera fx,fy,cx,cy")
+    matrix, projection = K.reshape(3, 3), P.reshape(3, 4)[:, :3]
+    # Drivers without a calibration leave K at zero or the identity, and some of them fill P alone.
+    rectified = rectified or matrix[0, 0] <= 1 < projection[0, 0]
+    if rectified and P.any():
+        matrix = projection
+    if matrix[0, 0] <= 1:
+        raise DatasetError(
+            f"is not calibrated (a focal length of {matrix[0, 0]:g} pixels); pass --camera fx,fy,cx,cy"
+        )
     try:
         full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
         camera = StatedCamera(full, _cut(full, info))
