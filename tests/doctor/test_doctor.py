@@ -350,3 +350,20 @@ def test_a_command_that_does_not_mend_a_recording_is_not_named(
     said = capsys.readouterr().out
     assert "--poses-are cm" not in said
     assert "none of the usual mistakes explains" in said
+
+
+def test_a_map_that_its_frames_contradict_ends_with_4_unless_forced(
+    room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing explains poses of other frames."""
+    shuffled = np.random.default_rng(0).permutation(len(room))
+    mixed = [replace(f, T_world_camera=room[k].T_world_camera) for f, k in zip(room, shuffled, strict=True)]
+    folder = write_tum(tmp_path / "mine", mixed)
+    coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--quiet")
+    assert carry_out("map", folder, "--out", tmp_path / "out", *coarse) == 4
+    refused = json.loads((tmp_path / "out/report.json").read_text())["refused"]
+    assert "held-out" in refused
+    assert refused in capsys.readouterr().err
+    assert carry_out("map", folder, "--out", tmp_path / "out", *coarse, "--overwrite", "--force") == 0
+    assert carry_out("doctor", folder, "--depth-scale", 1000) == 4
+    assert "none of the usual mistakes explains" in capsys.readouterr().out
