@@ -342,8 +342,8 @@ class Reset(Request):
 
 @dataclass(frozen=True)
 class Switch(Request):
-    """Remove a keyframe from the map, or add it again; None for ``on`` turns it over. With ``last``, all keyframes
-    up to that number that can be changed."""
+    """Remove a keyframe from the map, or add it again; None for ``on`` turns it over. With ``last``, all
+    keyframes up to that number that can be changed."""
 
     keyframe: int
     on: bool | None

@@ -56,6 +56,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, 
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.bounded import computed_rows
 from taichi_mrf.system.files import check_regular
 
 LOOP_CLOSURES = (1, 2, 3, 4)
@@ -87,7 +88,9 @@ class RtabmapDatabase:
         check_regular(path, DatasetError)
         with self._errors():
             self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
+            computed = computed_rows(self._connection)
         weakref.finalize(self, self._connection.close)
+        self._check(computed is None, f"not an RTAB-Map database: {computed}")
         missing = [name for name in ("Node", "Data", "Admin") if not self._columns(name)]
         if missing:
             raise DatasetError(f"{path}: not an RTAB-Map database: it lacks the table {', '.join(missing)}")

@@ -14,28 +14,28 @@ the unpackers of chunks up in tables, and take those of messages and files from 
 """
 
 import bz2
+import contextlib
 import importlib
 import os
 import re
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any
 
 from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.bounded import BoundedFile, computed_rows
 from taichi_mrf.system.files import check_regular, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
 
 _LEAST_BOUND, _LARGEST_RATIO = 1 << 26, 1000
 """Chunks are a few megabytes, and one large image at most; images of a single value pack a thousandfold."""
-
-_LEAST_FILE, _LARGEST_FILE_RATIO = 1 << 28, 100
-"""A whole file, which is unpacked to the disk. Recordings pack three to twenty times."""
 
 
 def bound_unpacking() -> None:
@@ -52,29 +52,24 @@ def bound_unpacking() -> None:
             table[name] = _bounded(unpackers[name], "chunk")
     vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"] = SimpleNamespace(
         decompress=_bounded(_zstd().ZstdDecompressor, "message"),
-        open=lambda packed, mode: _BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
+        open=lambda packed, mode: BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
     )
+    sqlite = importlib.import_module("rosbags.rosbag2.storage_sqlite3").Sqlite3Reader
+    if sqlite._open is not _open_stored:
+        _open_any[:] = [sqlite._open]
+        sqlite._open = _open_stored
 
 
-class _BoundedFile:
-    """A file that is unpacked while it is read, up to a bound."""
+_open_any: list[Callable[[Any], None]] = []
 
-    def __init__(self, stream: BinaryIO, packed_bytes: int) -> None:
-        self._stream, self._packed_bytes = stream, packed_bytes
-        self._left = max(_LEAST_FILE, _LARGEST_FILE_RATIO * packed_bytes)
 
-    def __enter__(self) -> "_BoundedFile":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stream.close()
-
-    def read(self, size: int) -> bytes:
-        found = self._stream.read(size)
-        self._left -= len(found)
-        if self._left < 0:
-            raise ValueError(f"a file of {self._packed_bytes:,} bytes unpacks to more than it may")
-        return found
+def _open_stored(reader: Any) -> None:
+    """Open a file of SQLite whose rows are stored in it."""
+    with contextlib.closing(sqlite3.connect(f"{reader.path.resolve().as_uri()}?mode=ro", uri=True)) as file:
+        computed = computed_rows(file)
+    if computed is not None:
+        raise ValueError(computed)
+    _open_any[0](reader)
 
 
 def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:
