@@ -302,8 +302,8 @@ def at_size(camera: PinholeCamera, width: int, height: int) -> str:
 
 
 def _png_damage(data: bytes, kept: list[bytes]) -> str | None:
-    """The damage of a PNG's chunks, or None. They are put into ``kept``, all but texts and colour profiles, which
-    libpng unpacks however large they are.
+    """The damage of a PNG's chunks, or None. They are put into ``kept``, all but texts and colour profiles,
+    which libpng unpacks however large they are.
 
     Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
     out the upper part of a cut image with zeros below, which would pass for missing depth. For what is

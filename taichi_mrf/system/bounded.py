@@ -1,10 +1,16 @@
 """Files from outside that could go on without end while they are read: packed streams, and databases whose
 rows are computed."""
 
+import functools
 import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 from taichi_mrf.system.packed import UnpackedBytes
+
+MOST_DIGITS = 18
+"""Of a count in a text; Python reads no more than 4,300, and raises ValueError."""
 
 
 class BoundedFile:
@@ -45,3 +51,16 @@ def computed_rows(connection: sqlite3.Connection) -> str | None:
         if kind == "table" and any(hidden for _, hidden in columns):
             return f"{name} has columns that are computed"
     return None
+
+
+def stored_only(opens: Callable[[Any], None]) -> Callable[[Any], None]:
+    """A function that opens a reader's database if its rows are stored, else it raises ValueError."""
+
+    @functools.wraps(opens)
+    def open_stored(reader: Any) -> None:
+        with closing(sqlite3.connect(f"{reader.path.resolve().as_uri()}?mode=ro", uri=True)) as file:
+            if computed := computed_rows(file):
+                raise ValueError(computed)
+        opens(reader)
+
+    return open_stored

@@ -1,8 +1,7 @@
 """Packed bytes from outside, unpacked without trust.
 
 One sum over all that is unpacked of a file bounds it, whatever its format: so many bytes, or so many times
-what the file takes. Measurements pack three to twenty times; only arrays of a single value pack a
-thousandfold.
+what the file takes. Measurements pack three to twenty times, arrays of a single value a thousandfold.
 """
 
 import zipfile
@@ -21,8 +20,6 @@ LEAST_BYTES, LARGEST_RATIO = 1 << 28, 100
 TEXT = 8
 """What a byte of text counts for: numbers and lists that are made of it take so many and more."""
 
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-
 
 class UnpackedBytes:
     """The sum for a file of ``packed_bytes``; what is unpacked again does not count again."""
@@ -34,9 +31,8 @@ class UnpackedBytes:
         """Count what is unpacked of a part of the file. Raises ValueError, which says how much that is."""
         total = self._sum + weight * unpacked - self._counted.get(name, 0)
         if total > max(LEAST_BYTES, LARGEST_RATIO * self._packed):
-            raise ValueError(
-                f"unpacks to {unpacked / 1e9:.3g} GB, too much for a file of {self._packed / 1e6:.3g} MB"
-            )
+            packed = f"{self._packed / 1e6:.3g} MB"
+            raise ValueError(f"unpacks to {unpacked / 1e9:.3g} GB, too much for a file of {packed}")
         self._sum, self._counted[name] = total, weight * unpacked
 
 
@@ -53,7 +49,7 @@ class ZipMembers:
     def open(self, name: str) -> IO[bytes]:
         """Open a member. Python's other unpackers have no bound: a kilobyte of bzip2 fills gigabytes."""
         info = self.members[name]
-        if info.compress_type not in _METHODS:
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise self.problem(name, f"is packed by the method {info.compress_type}, not by deflate")
         return self.archive.open(info)
 

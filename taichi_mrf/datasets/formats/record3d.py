@@ -80,9 +80,8 @@ class Files:
             raise DatasetError(f"{self.where(name)}: {MISSING}")
         size = self._zip.members[name].file_size
         if size > most_bytes:
-            raise DatasetError(
-                f"{self.where(name)}: claims {size:,} bytes; at most {most_bytes:,} are expected"
-            )
+            problem = f"claims {size:,} bytes; at most {most_bytes:,} are expected"
+            raise DatasetError(f"{self.where(name)}: {problem}")
         return self._zip.read(name, weight)
 
 

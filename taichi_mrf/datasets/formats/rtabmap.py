@@ -103,7 +103,7 @@ class RtabmapDatabase:
     def version(self) -> tuple[int, ...]:
         """RTAB-Map's version that wrote the tables, such as (0, 21, 4)."""
         text = next((row[0] for row in self._rows("SELECT version FROM Admin")), None)
-        return tuple(int(part) for part in str(text).split(".") if part.isdecimal())
+        return tuple(int(part[:9]) for part in str(text).split(".") if part.isdecimal())
 
     def nodes(self) -> list[Node]:
         """All nodes by id. Raises DatasetError."""

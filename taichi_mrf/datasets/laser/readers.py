@@ -32,7 +32,7 @@ from taichi_mrf.datasets.laser.scans import (
     skipped_note,
 )
 from taichi_mrf.errors import DatasetError, said
-from taichi_mrf.system.bounded import BoundedFile
+from taichi_mrf.system.bounded import MOST_DIGITS, BoundedFile
 from taichi_mrf.system.files import exists, is_file, is_folder, open_regular
 from taichi_mrf.system.npz_file import open_npz
 from taichi_mrf.system.packed import TEXT
@@ -175,7 +175,8 @@ def _robotlaser(words: list[str]) -> _Scan:
 def _count(words: list[str], at: int, what: str) -> int:
     if at >= len(words):
         raise _BadLineError(f"{words[0]} ends before the number of its {what}; the log may be truncated")
-    if not words[at].isdecimal() or (what == "ranges" and int(words[at]) == 0):
+    is_count = words[at].isdecimal() and len(words[at]) <= MOST_DIGITS
+    if not is_count or (what == "ranges" and int(words[at]) == 0):
         raise _BadLineError(f"{words[0]} has '{words[at][:40]}' as the number of its {what}")
     return int(words[at])
 

@@ -14,11 +14,9 @@ the unpackers of chunks up in tables, and take those of messages and files from 
 """
 
 import bz2
-import contextlib
 import importlib
 import os
 import re
-import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
 from taichi_mrf.errors import DatasetError, said
-from taichi_mrf.system.bounded import BoundedFile, computed_rows
+from taichi_mrf.system.bounded import BoundedFile, stored_only
 from taichi_mrf.system.files import check_regular, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
 
@@ -55,21 +53,7 @@ def bound_unpacking() -> None:
         open=lambda packed, mode: BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
     )
     sqlite = importlib.import_module("rosbags.rosbag2.storage_sqlite3").Sqlite3Reader
-    if sqlite._open is not _open_stored:
-        _open_any[:] = [sqlite._open]
-        sqlite._open = _open_stored
-
-
-_open_any: list[Callable[[Any], None]] = []
-
-
-def _open_stored(reader: Any) -> None:
-    """Open a file of SQLite whose rows are stored in it."""
-    with contextlib.closing(sqlite3.connect(f"{reader.path.resolve().as_uri()}?mode=ro", uri=True)) as file:
-        computed = computed_rows(file)
-    if computed is not None:
-        raise ValueError(computed)
-    _open_any[0](reader)
+    sqlite._open = stored_only(getattr(sqlite._open, "__wrapped__", sqlite._open))
 
 
 def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:
