@@ -207,7 +207,7 @@ class VolumeConfig:
             ok = all(a < b for a, b in zip(self.lower, self.upper, strict=True))
             check_field(ok, "volume.upper", "must lie above volume.lower on every axis")
         check_field(8 <= self.dense_bricks <= 1024, "volume.dense_bricks", "must lie between 8 and 1024")
-        check_field(self.memory_limit_gb >= 0, "volume.memory_limit_gb", "must not be negative")
+        check_field(0 <= self.memory_limit_gb < math.inf, "volume.memory_limit_gb", "must be 0 or more GB")
         check_field(0 <= self.window_m < math.inf, "volume.window_m", "must be 0 or a number of metres")
         check_field(self.min_evidence >= 0, "volume.min_evidence", "must not be negative")
 

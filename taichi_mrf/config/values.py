@@ -92,7 +92,7 @@ def note_gone(section: str, key: str, value: object) -> str | None:
     return "" if value == default else f"{key} is no longer a parameter: {became}"
 
 
-_LARGEST_INTEGER = 2**63 - 1
+_LARGEST = 2**63 - 1
 
 
 def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
@@ -209,7 +209,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             raise ConfigError(f"{where} must be a number, not {shown(value)}") from None
     if hint in (int, float) and isinstance(value, numbers.Real) and not isinstance(value, bool):
         value = int(value) if isinstance(value, numbers.Integral) else float(value)  # from NumPy's types
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_INTEGER:
+    if isinstance(value, int | float) and _LARGEST < abs(value) < float("inf"):  # a distance may be infinite
         raise ConfigError(f"{where} is too large a number: {shown(value)}")
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
-from taichi_mrf.system.npz_file import DEFLATE_RATIO
+from taichi_mrf.system.packed import DEFLATE_RATIO
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KNOWN = "PNG, JPEG, TIFF, WebP, BMP, PGM, PPM"
@@ -275,14 +275,15 @@ def _decode(data: bytes, where: str, flags: int, camera: PinholeCamera | None = 
     is_png, claimed = data.startswith(PNG_SIGNATURE), claimed_size(data)
     if claimed is not None:  # before any of it is unpacked
         _check_size(where, *claimed, camera)
-    problem = _png_damage(data) if is_png else None
+    kept: list[bytes] = []
+    problem = _png_damage(data, kept) if is_png else None
     if problem:
         raise DatasetError(f"{where}: {problem}")
     if claimed is None:
         what = f"no {KNOWN}, or its header is damaged" if data else "the file is empty"
         raise DatasetError(f"{where}: not a readable image ({what})")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(b"".join(kept) or data, np.uint8), flags)
     except (cv2.error, MemoryError):
         image = None
     if image is None:
@@ -317,14 +318,16 @@ def at_size(camera: PinholeCamera, width: int, height: int) -> str:
     )
 
 
-def _png_damage(data: bytes) -> str | None:
-    """The damage of a PNG's chunks, or None.
+def _png_damage(data: bytes, kept: list[bytes]) -> str | None:
+    """The damage of a PNG's chunks, or None. They are put into ``kept``, all but texts and colour profiles,
+    which libpng unpacks however large they are.
 
     Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
     out the upper part of a cut image with zeros below, which would pass for missing depth. For what is
     packed, the memory that the header claims is not taken before it is known to be filled.
     """
     position, packed = len(PNG_SIGNATURE), []
+    kept.append(PNG_SIGNATURE)
     while position + _CHUNK_BYTES <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
         end = position + _CHUNK_BYTES + length
@@ -337,6 +340,8 @@ def _png_damage(data: bytes) -> str | None:
             return "the image is damaged (its header is not where it should be)"
         if kind == b"IDAT":
             packed.append(data[position + 8 : end - 4])
+        if kind not in _TEXTS:
+            kept.append(data[position:end])
         if kind == b"IEND":
             return _png_content_damage(data, b"".join(packed))
         position = end
@@ -368,6 +373,7 @@ def _png_content_damage(data: bytes, packed: bytes) -> str | None:
 
 
 _CHUNK_BYTES = 12
+_TEXTS = (b"tEXt", b"zTXt", b"iTXt", b"iCCP")
 _PIECE = 1 << 20
 _SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Samples of a pixel by a PNG's type of colour."""

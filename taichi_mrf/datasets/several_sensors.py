@@ -16,7 +16,8 @@ sensors must count from one beginning, at poses in one world. Each frame states 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -143,6 +144,8 @@ class SeveralSensors(Table[SensorFrame]):
 def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
     """Open the recordings of all sensors. Raises DatasetError, which names the file and the sensor."""
     _refuse(path, options)
+    if _opening:
+        raise DatasetError(f"{path}: lists several sensors, as {_opening[0]} does: list all of them there")
     try:
         described = from_dict(SensorsFile, read_yaml(path), str(path))
     except ConfigError as error:
@@ -154,7 +157,7 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
         raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
     sensors, rows = [], []
     for entry, name in zip(described.sensors, names, strict=True):
-        with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError):
+        with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError), _opens(path):
             sensor = _open_sensor(path, entry, name, options)
         stamps, frame_names = sensor.dataset.stamps(), sensor.dataset.frame_names
         for i in range(0, len(sensor.dataset), entry.every):
@@ -171,6 +174,19 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
         sensors=sensors,
         rows=sorted(rows, key=lambda row: row.stamp),
     )
+
+
+_opening: list[Path] = []
+"""The file whose sensors are being opened: one that lists another could name itself, or grow without end."""
+
+
+@contextmanager
+def _opens(path: Path) -> Iterator[None]:
+    _opening.append(path)
+    try:
+        yield
+    finally:
+        _opening.clear()
 
 
 def _pose(sensor: RecordedSensor, index: int) -> Pose:

@@ -4,6 +4,7 @@ The viewer is spawned, never forked: a fork of a process in which Taichi runs ha
 thread writes the outbox to the pipe. Requests are read between two pieces of mapping.
 """
 
+import atexit
 import multiprocessing
 import signal
 import sys
@@ -67,6 +68,9 @@ class ViewerLink:
         )
         with _interrupts_ignored(), _main_left_alone():
             self._process.start()
+        # Runs before multiprocessing's own exit handler, which sends SIGTERM, and waits without end for a
+        # process that ignores it.
+        atexit.register(self.close)
         theirs.close()  # so that the connection ends with their process
         self._outbox = Outbox() if outbox is None else outbox
         self._lost: str | None = None
@@ -106,7 +110,9 @@ class ViewerLink:
         self._outbox.close()
 
     def close(self) -> None:
-        """End the viewer: ask it to, then terminate it, then kill it."""
+        """End the viewer: ask it to, then terminate it, then kill it. A program that does not call this does
+        so when it ends."""
+        atexit.unregister(self.close)
         self.ask_to_end()
         self._process.join(GOODBYE_SECONDS)
         for end in (self._process.terminate, self._process.kill):

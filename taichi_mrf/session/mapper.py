@@ -27,6 +27,7 @@ from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
+from taichi_mrf.session.edits import Edit, EditHistory, Pair
 from taichi_mrf.session.pictures import depth_colors, thumbnail
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.system import runtime
@@ -136,6 +137,7 @@ class Mapper:
         self.unsettled = self.saved_unsettled or self.stale
         self.shown = ShownMap(m, opened=self.lacks_messages and not self.unsettled)
         self.edited = False
+        self.edits = EditHistory()
         self.unaligned = False
         self.cavities_changed = False
 
@@ -178,6 +180,18 @@ class Mapper:
         """Sweep a keyframe once, by its number in the map, unless the map is about to be rebuilt."""
         if not self.stale:
             self.map.infer(sweeps=1, keyframes=[map_id])
+
+    def edit(self, edit: Edit) -> Pair:
+        """Carry out an edit of one keyframe; returns what takes it back, and what makes it again. Raises
+        KeyframeError."""
+        id, before = edit.keyframe, self.roster.find(edit.keyframe)
+        on, T = before.state == "on", before.T_world_camera
+        if isinstance(edit, messages.Move):
+            self.move(id, edit.T_world_camera)
+            return messages.Move(id, T), edit
+        wanted = not on if edit.on is None else edit.on
+        self.switch(id, wanted)
+        return messages.Switch(id, on), messages.Switch(id, wanted)
 
     def switch(self, id: int, on: bool) -> LiveKeyframe:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
@@ -368,6 +382,7 @@ class Mapper:
         """Note that the map has frozen a keyframe; returns the last message about it."""
         picture, entry.picture = entry.picture, FORGOTTEN
         entry.map_id, entry.state = None, "frozen"
+        self.edits.forget({entry.id})
         return self._message(entry, picture, crossed)
 
     def _add(self, entry: LiveKeyframe) -> int:

@@ -9,8 +9,8 @@ import numpy as np
 
 from taichi_mrf.runs.files import MAP_FILE, MESH_FILE, VOXEL_FILE
 from taichi_mrf.runs.folder import write_mesh_file, write_report, write_voxel_file
+from taichi_mrf.session.edits import Edit, Pair
 from taichi_mrf.session.extras import Extras
-from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.ray_answers import pixel_answer, point_answer
 from taichi_mrf.session.run import Run
 from taichi_mrf.viewer.messages import (
@@ -30,6 +30,7 @@ from taichi_mrf.viewer.messages import (
     Speed,
     Step,
     Switch,
+    Undo,
     Watch,
     WhoSays,
 )
@@ -59,10 +60,9 @@ class Requests:
             Step: self._step,
             Speed: self._speed,
             Reset: begin_anew,
-            Switch: lambda request: self._edit(request, lambda m: m.switch(request.keyframe, request.on)),
-            Move: lambda request: self._edit(
-                request, lambda m: m.move(request.keyframe, request.T_world_camera)
-            ),
+            Switch: self._edit,
+            Move: self._edit,
+            Undo: self._undo,
             Freeze: self._freeze,
             RayThrough: self._ray_through,
             PixelRay: self._pixel_ray,
@@ -99,13 +99,38 @@ class Requests:
         if self._run.replay is not None:
             self._run.replay.set_speed(request.factor)
 
-    def _edit(self, request: Switch | Move, change: Callable[[Mapper], LiveKeyframe]) -> None:
-        run = self._run
-        run.mapper.roster.find(request.keyframe)
+    def _edit(self, request: Edit) -> None:
+        mapper = self._run.mapper
+        mapper.roster.find(request.keyframe)
+        edits = [request]
+        if isinstance(request, Switch) and request.last is not None:
+            known = [each for each in mapper.roster.entries.values() if each.state != "frozen"]
+            ids = [each.id for each in known if request.keyframe <= each.id <= request.last]
+            edits = [Switch(id, request.on) for id in ids]
+        made: list[Pair] = []
         try:
-            change(run.mapper)
-        finally:  # even if it fails, the viewer is sent the present state
-            run.send(run.describe(request.keyframe))
+            self._carry_out(edits, made)
+        finally:
+            mapper.edits.note(made)
+
+    def _undo(self, request: Undo) -> None:
+        history = self._run.mapper.edits
+        edits = history.next(request.again)
+        if edits:
+            self._carry_out(edits, [])
+            history.step(request.again)
+
+    def _carry_out(self, edits: list[Edit], made: list[Pair]) -> None:
+        """Carry out edits; those that changed something are put into ``made``."""
+        run = self._run
+        try:
+            for edit in edits:
+                back, forth = run.mapper.edit(edit)
+                if isinstance(back, Move) or back != forth:
+                    made.append((back, forth))
+        finally:  # even if one fails, the viewer is sent the present state
+            for edit in edits:
+                run.send(run.describe(edit.keyframe))
             run.show_time(None)
             run.publish()
 

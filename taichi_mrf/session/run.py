@@ -97,6 +97,8 @@ class Progress:
             waiting or mapper.edited,
             replay.speed if replay and replay.has_pace else None,
             mapper.map.promise.sentence() if mapper.map.promise and mapper.map.settled else "",
+            mapper.edits.can_undo,
+            mapper.edits.can_redo,
         )
 
     def time_left(self, replay: Replay) -> str:

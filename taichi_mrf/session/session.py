@@ -34,7 +34,7 @@ from taichi_mrf.session.mapper import LiveKeyframe
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.requests import Requests, resumes_replay
 from taichi_mrf.session.run import Run, sweeping
-from taichi_mrf.session.session_core import EDITS, OF_ONE_KEYFRAME, Policy
+from taichi_mrf.session.session_core import EDITS, OF_KEYFRAMES, Policy
 from taichi_mrf.session.source import Source
 from taichi_mrf.viewer.messages import Listening, Notice, Request, Reset
 
@@ -304,7 +304,7 @@ class Session:
 
     def _may_carry_out(self, request: Request) -> bool:
         """Edits of keyframes of a map from a file wait for its messages, which only full inference brings."""
-        return not (self.state.mapper.lacks_messages and isinstance(request, OF_ONE_KEYFRAME))
+        return not (self.state.mapper.lacks_messages and isinstance(request, OF_KEYFRAMES))
 
 
 class _ShowingMover:

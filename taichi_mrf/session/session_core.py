@@ -24,6 +24,7 @@ from taichi_mrf.viewer.messages import (
     Save,
     Step,
     Switch,
+    Undo,
     Update,
 )
 from taichi_mrf.viewer.tune.messages import SaveTries
@@ -31,11 +32,16 @@ from taichi_mrf.viewer.tune.messages import SaveTries
 WAIT_SECONDS = 0.25
 """Longest delay before a signal is noticed while idle, in seconds."""
 
-EDITS = (Switch, Freeze, Move, Reset)
+OF_KEYFRAMES = (Switch, Freeze, Move, Undo)
+
+EDITS = (*OF_KEYFRAMES, Reset)
 """Requests that change the map, and so cannot be carried out while it is being inferred."""
 
-OF_ONE_KEYFRAME = (Switch, Freeze, Move)
+IN_ORDER = (Switch, Freeze, Undo)
+"""Edits of which each counts, as what it does depends on those before it."""
 
+MOST_IN_ORDER = 1000
+"""Edits that wait at most; more than that come from no hand, and are dropped."""
 
 SEND_SECONDS = 0.02
 """Time in which words leave this process before the compiler of kernels takes Python's lock."""
@@ -45,8 +51,8 @@ class WaitingRequests:
     """The requests of the page that are not carried out yet, the oldest first.
 
     A request replaces the last one about the same thing if that is of the same kind: of ten moves of a
-    keyframe only the last is carried out, but a move, a freeze and another move stay three requests. A Reset
-    drops all edits before it.
+    keyframe only the last is carried out, but a move, a freeze and another move stay three requests, and so
+    do three switches. A Reset drops all edits before it.
     """
 
     def __init__(self) -> None:
@@ -56,8 +62,17 @@ class WaitingRequests:
         """Add a request that has just arrived."""
         if isinstance(request, Reset):
             self._waiting = deque(each for each in self._waiting if not isinstance(each, (*EDITS, Step)))
-        subject = _subject(request)
-        before = next((each for each in reversed(self._waiting) if _subject(each) == subject), None)
+        if isinstance(request, IN_ORDER):
+            if len(self._waiting) < MOST_IN_ORDER:
+                self._waiting.append(request)
+            return
+        subject, moves = _subject(request), isinstance(request, Move)
+        related = (
+            each
+            for each in reversed(self._waiting)
+            if _subject(each) == subject or (moves and isinstance(each, IN_ORDER))
+        )
+        before = next(related, None)
         if type(before) is type(request):
             self._waiting = deque(each for each in self._waiting if each is not before)
         self._waiting.append(request)
@@ -88,7 +103,7 @@ class WaitingRequests:
 
 def _subject(request: Request) -> Hashable:
     """Subject of a request."""
-    if isinstance(request, OF_ONE_KEYFRAME):
+    if isinstance(request, Move):
         return "keyframe", request.keyframe
     if isinstance(request, Pause | Step):
         return "replay"

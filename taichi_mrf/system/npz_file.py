@@ -6,28 +6,21 @@ before it reads the values, and passes on whatever exception its parsers raise.
 
 import contextlib
 import sys
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError, TaichiMRFError, said
 from taichi_mrf.system.files import open_regular
-from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.packed import ZipMembers
 
 MANIFEST = "manifest"
 """The member that lists the others with their checksums: ``name crc32 bytes`` each."""
-
-DEFLATE_RATIO = 1032
-"""The highest compression ratio of deflate (zlib's technical details)."""
-
-_LEAST_BOUND, _LARGEST_RATIO = 1 << 28, 100
-"""Limits of what is read of a file: this many bytes, or this many times what it takes in the file.
-Measurements pack three to ten times; only arrays of a single value pack a thousandfold."""
 
 _CHUNK = 1 << 20
 _MOST_DIMENSIONS = 8
@@ -39,11 +32,9 @@ ErrorType = Callable[[str], TaichiMRFError]
 class NpzFile:
     """An open file; ``file[name]`` reads an array to its end, and so checks its checksum."""
 
-    def __init__(self, path: Path, archive: zipfile.ZipFile, error: ErrorType) -> None:
-        self._path, self._archive, self._error = path, archive, error
-        members = {info.filename: info for info in archive.infolist()}
-        self._members = {name.removesuffix(".npy"): info for name, info in members.items()}
-        self._packed_bytes = self._unpacked_bytes = 0
+    def __init__(self, path: Path, zipped: ZipMembers, error: ErrorType) -> None:
+        self._path, self._zip, self._error = path, zipped, error
+        self._members = {name.removesuffix(".npy"): info for name, info in zipped.members.items()}
 
     @property
     def names(self) -> list[str]:
@@ -64,12 +55,7 @@ class NpzFile:
             info = self._members[name]
             if stream.tell() + size != info.file_size:
                 raise self._problem(name, f"is {dtype} {shape} by its header, but has {info.file_size} bytes")
-            if info.file_size > DEFLATE_RATIO * (info.compress_size + 1):
-                raise self._problem(
-                    name, f"claims {info.file_size / 1e9:.3g} GB, more than the file can hold"
-                )
-            self._count_bytes(name, info)
-            check_memory(size, f"{self._path}: {name}")
+            self._zip.count(info.filename)
             values, place = np.empty(size, np.uint8), 0
             while chunk := stream.read(_CHUNK):
                 values[place : place + len(chunk)] = np.frombuffer(chunk, np.uint8)
@@ -136,22 +122,13 @@ class NpzFile:
         if name not in self._members:
             raise self._problem(name, "is missing")
         try:
-            with self._archive.open(self._members[name]) as stream:
+            with self._zip.open(self._members[name].filename) as stream:
                 shape, fortran, dtype = _read_header(stream)
                 yield stream, shape, fortran, dtype
         except TaichiMRFError:
             raise
         except Exception as error:  # zipfile, zlib and NumPy raise many kinds of exceptions
             raise self._problem(name, f"cannot be read: {said(error)}") from error
-
-    def _count_bytes(self, name: str, info: zipfile.ZipInfo) -> None:
-        self._packed_bytes += info.compress_size
-        self._unpacked_bytes += info.file_size
-        most = max(_LEAST_BOUND, _LARGEST_RATIO * self._packed_bytes)
-        if self._unpacked_bytes > most:
-            raise self._problem(
-                name, f"unpacks to {info.file_size / 1e9:.3g} GB, from {info.compress_size / 1e6:.3g} MB"
-            )
 
     def _problem(self, name: str, problem: str) -> TaichiMRFError:
         return self._error(f"{self._path}: {name} {problem}")
@@ -165,7 +142,8 @@ def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
     with contextlib.ExitStack() as opened:
         stream = opened.enter_context(open_regular(path, error))
         try:
-            archive = opened.enter_context(zipfile.ZipFile(stream))
+            zipped = ZipMembers(path, stream, error)
+            archive = opened.enter_context(zipped.archive)
         except OSError as problem:
             raise error(f"{path}: cannot be read: {problem.strerror or problem}") from problem
         except Exception as problem:  # as above
@@ -175,7 +153,7 @@ def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
         except Exception as problem:
             raise error(f"{path}: not {what}: {said(problem)}") from problem
         try:
-            yield NpzFile(path, archive, error)
+            yield NpzFile(path, zipped, error)
         except CapacityError:
             raise
         except MemoryError as problem:
@@ -190,14 +168,14 @@ def _is_text(array: NDArray[np.str_]) -> bool:
     return not (codes > sys.maxunicode).any()
 
 
-def _compare_names(archive: zipfile.ZipFile) -> None:
+def _compare_names(archive: ZipFile) -> None:
     """Open each member, which compares its name in the directory with the one in its own header. Otherwise an
     array with a damaged name would count as missing."""
     for info in archive.infolist():
         archive.open(info).close()
 
 
-def manifest_lines(members: Iterator[zipfile.ZipInfo]) -> list[str]:
+def manifest_lines(members: Iterator[ZipInfo]) -> list[str]:
     """The manifest's lines for members of an archive."""
     return [f"{i.filename.removesuffix('.npy')} {i.CRC:08x} {i.file_size}" for i in members]
 

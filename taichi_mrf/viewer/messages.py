@@ -180,7 +180,7 @@ class Status(Update):
     """Progress and figures. ``activity`` says what is being done, ``share`` how much of it is done (0 to 1),
     ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
     pace (0: as fast as possible), None where frames have none. ``free_space`` says how sure free space is, if
-    frames were held out for that."""
+    frames were held out for that. ``can_undo``, ``can_redo``: edits can be taken back, or made again."""
 
     activity: str
     share: float
@@ -197,6 +197,8 @@ class Status(Update):
     pending: bool
     speed: float | None = None
     free_space: str = ""
+    can_undo: bool = False
+    can_redo: bool = False
 
 
 @dataclass(frozen=True)
@@ -340,10 +342,12 @@ class Reset(Request):
 
 @dataclass(frozen=True)
 class Switch(Request):
-    """Remove a keyframe from the map, or add it again."""
+    """Remove a keyframe from the map, or add it again; None for ``on`` turns it over. With ``last``, all
+    keyframes up to that number that can be changed."""
 
     keyframe: int
-    on: bool
+    on: bool | None
+    last: int | None = None
 
 
 @dataclass(frozen=True)
@@ -359,6 +363,13 @@ class Move(Request):
 
     keyframe: int
     T_world_camera: Pose
+
+
+@dataclass(frozen=True)
+class Undo(Request):
+    """Take the last press of Switch or Move back, or make it ``again``."""
+
+    again: bool = False
 
 
 @dataclass(frozen=True)

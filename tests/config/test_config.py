@@ -214,7 +214,8 @@ def test_the_default_sensor_is_the_kinect_1(repository: Path) -> None:
         ("voxel_sise: 0.1", "unknown parameter 'voxel_sise'; did you mean 'voxel_size'"),
         ("inference: {sweps: 2}", "inference: unknown parameter 'sweps'; did you mean 'sweeps'"),
         ("zebra: 1", "known are: voxel_size"),
-        ("voxel_size: 1.0e+300", "voxel_size must be at most 1000 metres"),
+        ("voxel_size: 1.0e+10", "voxel_size must be at most 1000 metres"),
+        ("voxel_size: 1.0e+300", "voxel_size is too large a number: 1e+300"),
         ("voxel_size: -0.05", "voxel_size must be a positive number of metres, not -0.05"),
         ("voxel_size: .nan", "voxel_size must be a positive"),
         ("voxel_size: five", "voxel_size must be a number, not 'five'"),
@@ -277,3 +278,9 @@ def test_differences_names_the_fields() -> None:
     other = dataclasses.replace(Config(), voxel_size=0.1, keyframes=KeyframeConfig(rotation=0.5))
     assert differences(Config(), other) == ["voxel_size", "keyframes.rotation"]
     assert differences(other, other) == []
+
+
+@pytest.mark.parametrize("value", ["inf", "1e300", "nan", "-1", "9" * 5000])
+def test_a_memory_limit_is_a_number_of_gigabytes(value: str) -> None:
+    with pytest.raises(ConfigError, match="memory_limit_gb"):
+        from_dict(Config, {"volume": {"memory_limit_gb": value}}, "config")

@@ -317,3 +317,16 @@ def test_the_real_recordings_are_read(shared_data: Path, place: str, scans: int,
     assert [note.startswith("no return: ranges of 81.") for note in read.notes] == [True] * (
         "carmen" in place
     )
+
+
+def test_a_packed_log_may_unpack_to_what_its_size_lets_expect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each line is short, and there is no end of them."""
+    path = tmp_path / "endless.log.gz"
+    path.write_bytes(gzip.compress(b"FLASER 2 1 1 0 0 0\n" * 100_000))
+    monkeypatch.setattr("taichi_mrf.system.packed.LEAST_BYTES", 1_000_000)
+    with pytest.raises(DatasetError, match=r"endless\.log\.gz line \d+: the log unpacks to .* too much"):
+        open_scans(path, skip_bad_scans=True)
+    path.write_bytes(gzip.decompress(path.read_bytes())[:1900])
+    assert len(open_scans(path).range_m) == 100

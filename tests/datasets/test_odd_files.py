@@ -2,12 +2,14 @@
 
 import bz2
 import os
+import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import lz4.frame
 import numpy as np
 import pytest
@@ -32,6 +34,7 @@ from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.noise import PatchNoise
+from taichi_mrf.system import packed
 
 OPENERS: list[tuple[Callable[[Path], object], str]] = [
     (open_dataset, ".npz"),
@@ -266,8 +269,48 @@ def test_bags_with_compressed_messages_or_files_are_read_and_bounded(
     with writer:
         plain(Bag("mcap" if storage is StoragePlugin.MCAP else "db3", writer))
     assert len(open_dataset(tmp_path / "walk")) > 0
-    for bound in ("_LEAST_BOUND", "_LARGEST_RATIO", "_LEAST_FILE", "_LARGEST_FILE_RATIO"):
-        monkeypatch.setattr(tolerance, bound, 1)
+    for name in ("_LEAST_BOUND", "_LARGEST_RATIO"):
+        monkeypatch.setattr(tolerance, name, 1)
+    for name in ("LEAST_BYTES", "LARGEST_RATIO"):
+        monkeypatch.setattr(packed, name, 1)
     what = "message" if mode is CompressionMode.MESSAGE else "file"
-    with pytest.raises(DatasetError, match=rf"a {what} of [\d,]+ bytes .*unpacks? to more than it may"):
+    with pytest.raises(DatasetError, match=f"{what} of .* may|too much for a file"):
         open_dataset(tmp_path / "walk").read(0)
+
+
+def test_texts_in_a_png_are_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A megabyte of them takes seconds, at each image."""
+    image = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    plain = cv2.imencode(".png", image)[1].tobytes()
+    texts = b"".join(
+        struct.pack(">I", len(text)) + kind + text + struct.pack(">I", zlib.crc32(kind + text))
+        for kind in (b"tEXt", b"zTXt", b"iTXt", b"iCCP")
+        for text in [b"a\0\0" + zlib.compress(bytes(1000))]
+    )
+    path, given, decode = tmp_path / "texts.png", [], cv2.imdecode
+    path.write_bytes(plain[:33] + texts + plain[33:])  # after the header
+
+    def spied(data: np.ndarray, flags: int) -> np.ndarray:
+        given.append(data.tobytes())
+        return decode(data, flags)
+
+    monkeypatch.setattr(cv2, "imdecode", spied)
+    np.testing.assert_array_equal(read_depth(path, 1.0), image)
+    assert given == [plain]
+
+
+@pytest.mark.parametrize(
+    "made", ["VIEW schema AS SELECT 4 AS schema_version", "TABLE other (a, b AS (zeroblob(900000000)))"]
+)
+def test_a_bag_whose_rows_are_computed_is_refused(tmp_path: Path, made: str) -> None:
+    path = tmp_path / "walk"
+    writer: Any = Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        plain(Bag("db3", writer))
+    assert len(open_dataset(path)) > 0
+    with sqlite3.connect(path / "walk.db3") as connection:
+        connection.execute("DROP TABLE IF EXISTS schema")
+        connection.execute(f"CREATE {made}")
+    connection.close()
+    with pytest.raises(DatasetError, match=r"walk: .*(schema is no table|other has columns that are comp)"):
+        open_dataset(path)

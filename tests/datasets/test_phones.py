@@ -192,6 +192,19 @@ def test_a_member_that_claims_too_much_is_not_unpacked(tmp_path: Path) -> None:
     dataset.read(1)
 
 
+def test_metadata_may_unpack_to_what_the_file_s_size_lets_expect(tmp_path: Path) -> None:
+    """A hundred kilobytes may be a hundred megabytes of text, which are gigabytes of lists."""
+    good = write_record3d(tmp_path / "good.r3d", CONTENT)
+    path = tmp_path / "walk.r3d"
+    with zipfile.ZipFile(good) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in old.namelist():
+            archive.writestr(name, b"[" + b"{}," * 40_000_000 if name == "metadata" else old.read(name))
+    with pytest.raises(
+        DatasetError, match=r"walk\.r3d: metadata unpacks to 0\.12 GB, too much for a file of"
+    ):
+        open_dataset(path)
+
+
 @pytest.mark.parametrize(
     ("members", "problem"),
     [({"rgbd/0.depth": b""}, "metadata: the file is missing"), ({"metadata": b"{}"}, "contains no rgbd")],

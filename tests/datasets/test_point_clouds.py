@@ -142,6 +142,7 @@ WRONG_HEADERS: list[tuple[Callable[..., Path], bytes, bytes, str]] = [
             (b"property float z", b"property list uchar float z", "is not one number"),
             (b"property float z", b"property double x", "is not one number"),
             (b"element vertex 42", b"element vertex many", "'many' is not a number of elements"),
+            (b"element vertex 42", b"element vertex " + b"9" * 5000, "9' is not a number of elements"),
             (b"element vertex 42", b"element vertex", "is cut short"),
             (b"element vertex", b"element camera", "first element is not the vertex"),
         )

@@ -245,3 +245,31 @@ def test_any_value_is_read_or_refused(tmp_path: Path, place: str, value: object)
     except DatasetError as error:
         problem = str(error)
     assert str(path) in problem
+
+
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+
+
+@pytest.mark.parametrize(
+    ("table", "made"),
+    [
+        (
+            "Data",
+            "VIEW Data AS SELECT 1 AS id, zeroblob(900000000) AS depth, 0 AS image, 0 AS calibration",
+        ),
+        ("Link", f"VIEW Link AS {ENDLESS} SELECT i AS from_id, 0 AS to_id, 1 AS type, 0 AS transform FROM n"),
+        ("Node", f"VIEW Node AS {ENDLESS} SELECT i AS id, 0 AS map_id, 0 AS stamp, NULL AS pose FROM n"),
+        ("Data", "TABLE Data (id, image, calibration, depth AS (zeroblob(900000000)))"),
+        ("Link", "VIRTUAL TABLE Link USING fts5(from_id, to_id, type, transform)"),
+    ],
+)
+def test_a_table_whose_rows_are_computed_is_refused(tmp_path: Path, table: str, made: str) -> None:
+    """A file of a few kilobytes has rows and bytes without end there."""
+    path = tmp_path / "walk.db"
+    filled(path)
+    with sqlite3.connect(path) as connection:
+        connection.execute(f"DROP TABLE {table}")
+        connection.execute(f"CREATE {made}")
+    connection.close()
+    with pytest.raises(DatasetError, match=rf"walk\.db: not an RTAB-Map database: {table} (is no|has col)"):
+        open_dataset(path)

@@ -16,6 +16,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.several_sensors import SeveralSensors
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -165,3 +166,15 @@ def test_a_broken_frame_is_named_by_its_sensor(robot: Path) -> None:
     dataset = open_dataset(robot)
     bad_frame(dataset, 0, "scan-000.npz: none of 2 points")
     assert dataset.read(6).sensor == "lidar"
+
+
+@pytest.mark.parametrize("source", ["robot.yaml", "other.yaml"])
+def test_a_file_lists_no_file_of_several_sensors(robot: Path, source: str) -> None:
+    """It could name itself, or files that name each other, or grow without end."""
+    other = robot.with_name("other.yaml")
+    other.write_text(robot.read_text())
+    ring = f"sensors: [{{source: {source}}}, {{source: {source}}}]"
+    robot.write_text(ring)
+    with pytest.raises(DatasetError, match=r"lists several sensors, as .*robot\.yaml does: list all of them"):
+        open_dataset(robot)
+    assert len(open_dataset(other)) == 7, "what was refused changes nothing"

@@ -15,7 +15,7 @@ from live_scene import (
     shown,
 )
 
-from taichi_mrf.viewer.messages import Bricks, Freeze, KeyframeInfo, Move, Request, Switch, Update
+from taichi_mrf.viewer.messages import Bricks, Freeze, KeyframeInfo, Move, Request, Switch, Undo, Update
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -106,3 +106,63 @@ def test_an_edit_breaks_full_inference_off_and_is_seen_at_once() -> None:
     assert set(at_once.bricks["map"]) == without
     assert len(at_once.voxels()) > 0
     assert_shown_is(session, link)
+
+
+def states(link: FakeLink) -> list[str]:
+    return [each.state for each in shown(link.sent).keyframes.values()]
+
+
+def test_presses_before_the_first_is_answered_are_taken_back_in_their_order() -> None:
+    """On/off, then Undo and On/off again, of one client or of two: after all Undo it is as at first."""
+    link = FakeLink()
+    session = session_of(link)
+    before = marginals(finished(session))
+    link.ask(Switch(1, None), Undo(), Switch(1, None))
+    finished(session)
+    assert states(link) == ["on", "off", "on", "on"]
+    link.ask(Switch(1, None), Switch(1, None), Undo(), Undo(), Undo(), Undo())
+    assert marginals(finished(session)) == before
+    assert states(link) == ["on"] * 4
+    assert (last_status(link).can_undo, last_status(link).can_redo) == (False, True)
+    link.ask(Undo(again=True))
+    finished(session)
+    assert states(link) == ["on", "off", "on", "on"]
+    assert link.errors() == []
+
+
+def test_edits_of_one_press_are_taken_back_together() -> None:
+    """They leave out what is as they want it, and what is frozen."""
+    link = FakeLink()
+    session = session_of(link)
+    finished(session)
+    link.ask(Switch(2, False), Freeze(3), Switch(1, False, last=3))
+    finished(session)
+    assert states(link) == ["on", "off", "off", "frozen"]
+    link.ask(Undo())
+    finished(session)
+    assert states(link) == ["on", "on", "off", "frozen"]
+    link.ask(Switch(1, None, last=2))
+    finished(session)
+    assert states(link) == ["on", "off", "on", "frozen"]
+    link.ask(Undo(), Undo())
+    finished(session)
+    assert states(link) == ["on", "on", "on", "frozen"]
+    link.ask(Switch(1, True), Undo())  # it did nothing, so there is nothing to take back
+    finished(session)
+    assert not last_status(link).can_undo
+    assert link.errors() == []
+
+
+def test_edits_of_a_frozen_keyframe_cannot_be_taken_back() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    finished(session)
+    T = small_room.frames()[1].T_world_camera.copy()
+    T[:3, 3] += 0.2
+    link.ask(Move(1, T), Move(0, T), Freeze(1), Undo())
+    finished(session)
+    assert not last_status(link).can_undo
+    known = shown(link.sent).keyframes
+    np.testing.assert_array_equal(known[1].T_world_camera, T)
+    np.testing.assert_array_equal(known[0].T_world_camera, small_room.frames()[0].T_world_camera)
+    assert link.errors() == []

@@ -11,8 +11,10 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import small_room
+from live_program import DEADLINE_S
 from live_scene import FakeLink, assert_shown_is, shown
 
 import taichi_mrf as tm
@@ -156,3 +158,25 @@ def test_a_script_without_a_guard_has_a_page(tmp_path: Path) -> None:
         run.send_signal(signal.SIGINT)
         rest, errors = run.communicate()
     assert (rest, run.returncode) == ("ended\n", 0), errors
+
+
+@pytest.mark.parametrize("end", ["", "raise SystemExit(0)", "del page", "raise ValueError"])
+def test_a_script_that_leaves_its_page_open_ends(tmp_path: Path, end: str) -> None:
+    """The page's process ignores SIGTERM, and ends with the script all the same."""
+    path = tmp_path / "open.py"
+    path.write_text(
+        f"import multiprocessing, taichi_mrf as tm\ntm.init('cpu')\npage = tm.live(tm.MRFMap(0.1), port=0)\n"
+        f"print(*[each.pid for each in multiprocessing.active_children()], flush=True)\n{end}\n"
+    )
+    pipes: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, path], text=True, **pipes) as run:
+        pids = [int(word) for word in run.stdout.readline().split()]
+        try:
+            errors = run.communicate(timeout=DEADLINE_S)[1]
+        finally:
+            pages = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
+            for process in pages:
+                process.kill()
+    assert run.returncode == (end == "raise ValueError"), errors
+    assert pids
+    assert not pages

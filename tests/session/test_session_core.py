@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.session.session_core import WaitingRequests
-from taichi_mrf.viewer.messages import Freeze, Move, Pause, Request, Reset, Save, Speed, Step, Switch
+from taichi_mrf.viewer.messages import Freeze, Move, Pause, Request, Reset, Save, Speed, Step, Switch, Undo
 from taichi_mrf.viewer.tune.messages import SaveTries
 
 
@@ -22,7 +22,9 @@ def move(keyframe: int, x: float) -> Move:
         ([Speed(1.0), Pause(True), Speed(2.0)], [1, 2]),
         ([move(3, 0.1), move(4, 0.1), move(3, 0.2)], [1, 2]),
         ([move(3, 0.1), Freeze(3), move(3, 0.2)], [0, 1, 2]),
-        ([Switch(2, False), Switch(2, True)], [1]),
+        ([Switch(2, None), Switch(2, None), Undo(), Undo(), Freeze(1), Freeze(2)], [0, 1, 2, 3, 4, 5]),
+        ([move(3, 0.1), Undo(), move(3, 0.2), Switch(4, None), move(3, 0.3)], [0, 1, 2, 3, 4]),
+        ([Switch(2, None)] * 1500 + [Pause(True)], [*range(1000), 1500]),
         ([Pause(True), Step(), Pause(False)], [0, 1, 2]),
         ([move(3, 0.1), Switch(1, False), Step(), Speed(1.0), Reset()], [3, 4]),
         ([SaveTries("yaml", 1, 7), SaveTries("yaml", 2, 7), SaveTries("yaml", 1, 7)], [1, 2]),

@@ -18,7 +18,6 @@ import json
 import math
 import struct
 import weakref
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -40,15 +39,12 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_file, is_folder, open_regular, read_bytes
 from taichi_mrf.system.libraries import library
-from taichi_mrf.system.memory import check_memory
-from taichi_mrf.system.npz_file import DEFLATE_RATIO
+from taichi_mrf.system.packed import TEXT, ZipMembers
 
 MISSING = "the file is missing"
 _LZFSE, _END = b"bvx", b"bvx$"
 _LEAST_HEADER = 32
 """Bytes of an LZFSE block's header without its table of frequencies."""
-
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class Files:
@@ -64,39 +60,29 @@ class Files:
             return
         stream = open_regular(path, DatasetError)
         try:
-            self._archive = zipfile.ZipFile(stream)
+            self._zip = ZipMembers(path, stream, DatasetError)
         except Exception as error:  # zipfile raises many kinds of errors
             stream.close()
             raise DatasetError(f"{path}: not a recording of Record3D: {said(error)}") from error
-        self.names = frozenset(self._archive.NameToInfo)
+        self.names = frozenset(self._zip.members)
         weakref.finalize(self, stream.close)
 
     def where(self, name: str) -> str:
         """Name of a file in errors."""
         return f"{self.path}: {name}" if self.zipped else str(self.path / name)
 
-    def read(self, name: str, most_bytes: int) -> bytes:
+    def read(self, name: str, most_bytes: int, weight: int = 1) -> bytes:
         """A file's content. Raises DatasetError, which names the file, if it is missing, damaged or larger
-        than ``most_bytes``."""
+        than ``most_bytes``, or unpacks to too much; ``weight`` is what each byte counts for then."""
         if not self.zipped:
             return read_bytes(self.path / name, DatasetError, MISSING, most_bytes)
         if name not in self.names:
             raise DatasetError(f"{self.where(name)}: {MISSING}")
-        info = self._archive.getinfo(name)
-        size = info.file_size
-        if size > most_bytes or size > DEFLATE_RATIO * (info.compress_size + 1):
-            raise DatasetError(
-                f"{self.where(name)}: claims {size:,} bytes; at most {most_bytes:,} are expected"
-            )
-        if info.compress_type not in _METHODS:
-            raise DatasetError(
-                f"{self.where(name)}: is packed by the method {info.compress_type}, not by deflate"
-            )
-        check_memory(size, self.where(name))
-        try:
-            return self._archive.read(info)
-        except Exception as error:
-            raise DatasetError(f"{self.where(name)}: cannot be read: {said(error)}") from error
+        size = self._zip.members[name].file_size
+        if size > most_bytes:
+            problem = f"claims {size:,} bytes; at most {most_bytes:,} are expected"
+            raise DatasetError(f"{self.where(name)}: {problem}")
+        return self._zip.read(name, weight)
 
 
 def is_packed(data: bytes) -> bool:
@@ -350,7 +336,7 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
     numbers = sorted(number for name in files.names if (number := _number_of(name)) is not None)
     if not numbers:
         raise DatasetError(f"{path}: contains no {IMAGES}/N.depth")
-    metadata = read_metadata(files.where(METADATA), files.read(METADATA, _MOST_METADATA))
+    metadata = read_metadata(files.where(METADATA), files.read(METADATA, _MOST_METADATA, TEXT))
     if not (metadata.has_poses or options.track):
         raise DatasetError(
             f"{metadata.where}: contains no poses, as recordings of the front camera do not; --track-poses "

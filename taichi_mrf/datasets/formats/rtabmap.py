@@ -56,6 +56,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, 
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.bounded import computed_rows
 from taichi_mrf.system.files import check_regular
 
 LOOP_CLOSURES = (1, 2, 3, 4)
@@ -87,7 +88,9 @@ class RtabmapDatabase:
         check_regular(path, DatasetError)
         with self._errors():
             self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
+            computed = computed_rows(self._connection)
         weakref.finalize(self, self._connection.close)
+        self._check(computed is None, f"not an RTAB-Map database: {computed}")
         missing = [name for name in ("Node", "Data", "Admin") if not self._columns(name)]
         if missing:
             raise DatasetError(f"{path}: not an RTAB-Map database: it lacks the table {', '.join(missing)}")
@@ -100,7 +103,7 @@ class RtabmapDatabase:
     def version(self) -> tuple[int, ...]:
         """RTAB-Map's version that wrote the tables, such as (0, 21, 4)."""
         text = next((row[0] for row in self._rows("SELECT version FROM Admin")), None)
-        return tuple(int(part) for part in str(text).split(".") if part.isdecimal())
+        return tuple(int(part[:9]) for part in str(text).split(".") if part.isdecimal())
 
     def nodes(self) -> list[Node]:
         """All nodes by id. Raises DatasetError."""

@@ -18,7 +18,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,10 @@ from taichi_mrf.datasets.laser.scans import (
     skipped_note,
 )
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.bounded import MOST_DIGITS, BoundedFile
 from taichi_mrf.system.files import exists, is_file, is_folder, open_regular
 from taichi_mrf.system.npz_file import open_npz
+from taichi_mrf.system.packed import TEXT
 
 GZIP_MAGIC = b"\x1f\x8b"
 SCAN_LINES = (b"FLASER", b"RLASER", b"ROBOTLASER1")
@@ -128,10 +130,13 @@ def field_of_view_angles(beams: int) -> NDArray[np.float64]:
 def _scan_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The lines that are scans, in words, with their numbers from 1 on."""
     with open_regular(path, DatasetError) as raw:
-        packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+        file: Any = raw
+        if raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC:  # a few kilobytes may hold lines that fill the memory
+            file = BoundedFile(gzip.GzipFile(fileobj=raw), raw.seek(0, 2), TEXT)
         raw.seek(0)
-        file = gzip.GzipFile(fileobj=raw) if packed else raw
-        for number, line in enumerate(_lines(path, file), start=1):
+        number = 0
+        while line := _line(path, number, file):
+            number += 1
             # Cheaper than splitting the odometry, which is most of the lines.
             if line.lstrip().startswith(SCAN_LINES):
                 words = line.decode("ascii", errors="replace").split()
@@ -139,14 +144,15 @@ def _scan_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                     yield number, words
 
 
-def _lines(path: Path, file: BinaryIO | gzip.GzipFile) -> Iterator[bytes]:
-    """The lines of a log. A packed log of a few kilobytes may hold a line that fills the memory."""
-    number = 0
-    while line := file.readline(_LONGEST_LINE):
-        number += 1
-        if len(line) == _LONGEST_LINE:
-            raise DatasetError(f"{path} line {number}: longer than {_LONGEST_LINE:,} bytes")
-        yield line
+def _line(path: Path, number: int, file: Any) -> bytes:
+    """The next line, after so many others."""
+    try:
+        line: bytes = file.readline(_LONGEST_LINE)
+    except ValueError as problem:
+        raise DatasetError(f"{path} line {number + 1}: the log {problem}") from None
+    if len(line) == _LONGEST_LINE:
+        raise DatasetError(f"{path} line {number + 1}: longer than {_LONGEST_LINE:,} bytes")
+    return line
 
 
 def _laser(words: list[str]) -> _Scan:
@@ -169,7 +175,8 @@ def _robotlaser(words: list[str]) -> _Scan:
 def _count(words: list[str], at: int, what: str) -> int:
     if at >= len(words):
         raise _BadLineError(f"{words[0]} ends before the number of its {what}; the log may be truncated")
-    if not words[at].isdecimal() or (what == "ranges" and int(words[at]) == 0):
+    is_count = words[at].isdecimal() and len(words[at]) <= MOST_DIGITS
+    if not is_count or (what == "ranges" and int(words[at]) == 0):
         raise _BadLineError(f"{words[0]} has '{words[at][:40]}' as the number of its {what}")
     return int(words[at])
 

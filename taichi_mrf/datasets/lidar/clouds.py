@@ -20,6 +20,7 @@ from taichi_mrf.datasets.lidar.las_file import read_las
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.system.bounded import MOST_DIGITS
 from taichi_mrf.system.files import open_regular, read_bytes
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.system.npz_file import NpzFile, open_npz
@@ -344,7 +345,7 @@ def _word(path: Path, words: list[str], place: int) -> str:
 
 def _count(path: Path, words: list[str]) -> int:
     word = _word(path, words, 2)
-    if not (word.isascii() and word.isdecimal()):
+    if not (word.isascii() and word.isdecimal() and len(word) <= MOST_DIGITS):
         raise DatasetError(f"{path}: {word[:40]!r} is not a number of elements")
     return int(word)
 

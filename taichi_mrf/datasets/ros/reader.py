@@ -22,20 +22,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any
 
 from taichi_mrf.datasets.base import Row
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.bounded import BoundedFile, stored_only
 from taichi_mrf.system.files import check_regular, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
 
 _LEAST_BOUND, _LARGEST_RATIO = 1 << 26, 1000
 """Chunks are a few megabytes, and one large image at most; images of a single value pack a thousandfold."""
-
-_LEAST_FILE, _LARGEST_FILE_RATIO = 1 << 28, 100
-"""A whole file, which is unpacked to the disk. Recordings pack three to twenty times."""
 
 
 def bound_unpacking() -> None:
@@ -52,29 +50,10 @@ def bound_unpacking() -> None:
             table[name] = _bounded(unpackers[name], "chunk")
     vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"] = SimpleNamespace(
         decompress=_bounded(_zstd().ZstdDecompressor, "message"),
-        open=lambda packed, mode: _BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
+        open=lambda packed, mode: BoundedFile(_zstd().open(packed, mode), os.fstat(packed.fileno()).st_size),
     )
-
-
-class _BoundedFile:
-    """A file that is unpacked while it is read, up to a bound."""
-
-    def __init__(self, stream: BinaryIO, packed_bytes: int) -> None:
-        self._stream, self._packed_bytes = stream, packed_bytes
-        self._left = max(_LEAST_FILE, _LARGEST_FILE_RATIO * packed_bytes)
-
-    def __enter__(self) -> "_BoundedFile":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stream.close()
-
-    def read(self, size: int) -> bytes:
-        found = self._stream.read(size)
-        self._left -= len(found)
-        if self._left < 0:
-            raise ValueError(f"a file of {self._packed_bytes:,} bytes unpacks to more than it may")
-        return found
+    sqlite = importlib.import_module("rosbags.rosbag2.storage_sqlite3").Sqlite3Reader
+    sqlite._open = stored_only(getattr(sqlite._open, "__wrapped__", sqlite._open))
 
 
 def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:

@@ -1,6 +1,6 @@
 """The live page: what updates and events do to its scene and its widgets."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -36,9 +36,6 @@ from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import change, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
 
-Edit = m.Switch | m.Move
-"""Edits of a keyframe that can be taken back."""
-
 MOST_ASKED = 32
 """Of as many voxels in a rectangle keyframes are asked at most."""
 
@@ -58,10 +55,6 @@ class Page(BasePage[Panel]):
         self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
         self._in_photo = False  # whether the page has opened in the colours of photographs
-        self._edits: list[list[tuple[Edit, Edit]]] = []
-        """Edits that can be taken back and made again, those of one press together: what undoes each, and
-        itself."""
-        self._done = 0  # how many of them are made
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
@@ -89,13 +82,13 @@ class Page(BasePage[Panel]):
             "Speed": lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
             "Follow": lambda client: self.panel.set_following(),
             "Reset": self._reset,
-            "Undo": lambda client: self._redo(back=True),
-            "Redo": lambda client: self._redo(),
+            "Undo": lambda client: ask(m.Undo()),
+            "Redo": lambda client: ask(m.Undo(again=True)),
             "Recording": self._choose_recording,
             AGREE: self.panel.agree,
             DECLINE: self.panel.close_question,
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
-            "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
+            "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, None)),
             "All off": lambda client: self._switch_range(False),
             "All on": lambda client: self._switch_range(True),
             "Freeze": self._freeze,
@@ -141,7 +134,6 @@ class Page(BasePage[Panel]):
         self.begin_map(hello)
         self._hello, self._in_photo = hello, False
         self.answer.clear()
-        self._forget_edits(self.keyframes.keyframes)
         change(self.panel.unsaved, visible=False)
         self.keyframes.clear()
         self.panel.ray.clear()
@@ -154,6 +146,7 @@ class Page(BasePage[Panel]):
 
     def _take_status(self, status: m.Status) -> None:
         self.panel.show_status(status)
+        self.panel.show_history(status.can_undo, status.can_redo)
         growing = not (status.paused or status.finished)
         if self.map is not None and growing != self.map.growing:
             before = self._extras(self.options)
@@ -176,8 +169,6 @@ class Page(BasePage[Panel]):
             self.panel.show_in_photo_colors()
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
-        if keyframe.state == "frozen":
-            self._forget_edits({keyframe.id})
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
@@ -287,50 +278,14 @@ class Page(BasePage[Panel]):
         """Send a request about the chosen keyframe, unless it is frozen or there is none."""
         chosen = self._changeable()
         if chosen is not None:
-            request = request_for(chosen)
-            self._make(request) if isinstance(request, Edit) else self.ask(request)
-
-    def _make(self, *edits: Edit) -> None:
-        """Send edits that can be taken back together."""
-        pairs: list[tuple[Edit, Edit]] = []
-        for edit in edits:
-            before = self.keyframes.keyframes[edit.keyframe]
-            if isinstance(edit, m.Switch):
-                pairs.append((m.Switch(edit.keyframe, before.state == "on"), edit))
-            else:
-                pairs.append((m.Move(edit.keyframe, before.T_world_camera), edit))
-        if pairs:
-            self._edits[self._done :] = [pairs]
-            self._done += 1
-            self._show_history()
-        for edit in edits:
-            self.ask(edit)
+            self.ask(request_for(chosen))
 
     def _switch_range(self, on: bool) -> None:
         """Switch all keyframes from one number to another on or off."""
         first, last = self.panel.range.value
-        state = "off" if on else "on"
-        known = sorted(self.keyframes.keyframes.items())
-        self._make(*(m.Switch(id, on) for id, each in known if first <= id <= last and each.state == state))
-
-    def _redo(self, back: bool = False) -> None:
-        """Make the next edit again, or take the last one ``back``."""
-        place = self._done - back
-        if 0 <= place < len(self._edits):
-            self._done = place + (not back)
-            self._show_history()
-            for pair in self._edits[place]:
-                self.ask(pair[0 if back else 1])
-
-    def _forget_edits(self, keyframes: Collection[int]) -> None:
-        """Edits of these keyframes can no longer be taken back."""
-        left = [[pair for pair in pairs if pair[1].keyframe not in keyframes] for pairs in self._edits]
-        self._done = sum(map(bool, left[: self._done]))
-        self._edits = [pairs for pairs in left if pairs]
-        self._show_history()
-
-    def _show_history(self) -> None:
-        self.panel.show_history(self._done > 0, self._done < len(self._edits))
+        known = [id for id in self.keyframes.keyframes if first <= id <= last]
+        if known:
+            self.ask(m.Switch(min(known), on, max(known)))
 
     def _changeable(self) -> m.KeyframeInfo | None:
         """The chosen keyframe; None, with a notice that says why, if it cannot be changed."""
@@ -364,7 +319,7 @@ class Page(BasePage[Panel]):
         gizmo, keyframe = self.keyframes.gizmo, self.keyframes.chosen
         if gizmo is not None and keyframe is not None and not dragged.holding:
             pose = vtf.SE3(np.array([*gizmo.wxyz, *gizmo.position], np.float64))
-            self._make(m.Move(keyframe, np.asarray(pose.as_matrix(), np.float64)))
+            self.ask(m.Move(keyframe, np.asarray(pose.as_matrix(), np.float64)))
 
     def _choose(self, keyframe: int | None) -> None:
         if keyframe == self.keyframes.chosen:
@@ -439,7 +394,7 @@ class Page(BasePage[Panel]):
         voxel."""
         listed = self.answer.said_by[place : place + 1]
         if listed and self.keyframes.keyframes[listed[0]].state == "on" and self.answer.point is not None:
-            self._make(m.Switch(listed[0], False))
+            self.ask(m.Switch(listed[0], False))
             self.ask(self._question)
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool, int | None]:
