@@ -123,13 +123,13 @@ class Judge:
 
     def __init__(self, anew: MRFMap, held_out: Sequence[Frame]) -> None:
         self.anew, self.held_out = anew, held_out
-        self.centres, self.p = anew.voxels(0.0)
+        self.centres, self.p = anew.marginals.voxels(0.0)
         self.accuracy = self._accuracy(anew)
 
     def row(self, what: str, m: MRFMap, clock: Clock) -> float:
         """Print a row and return how many points the map is less accurate than the new one; infinite if too
         many answers differ."""
-        p = m.occupancy(self.centres)
+        p = m.marginals.occupancy(self.centres)
         near = float((np.abs(p - self.p) <= 0.02).mean())
         same = float(((p > 0.5) == (self.p > 0.5)).mean())
         right = self._accuracy(m)
@@ -139,7 +139,7 @@ class Judge:
 
     def equal(self, m: MRFMap) -> bool:
         """True if the maps have the same voxels with the same probabilities, bit for bit."""
-        (centres, p), (others, q) = (_sorted(*each.voxels(0.0)) for each in (m, self.anew))
+        (centres, p), (others, q) = (_sorted(*each.marginals.voxels(0.0)) for each in (m, self.anew))
         return np.array_equal(centres, others) and np.array_equal(p, q)
 
     def _accuracy(self, m: MRFMap) -> float:

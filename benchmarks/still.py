@@ -74,7 +74,7 @@ class Listener:
 
 def dynamic_share(m: MRFMap) -> float:
     """The share of a map's occupied voxels that are in its dynamic layer."""
-    return len(m.dynamic.voxels()[0]) / max(1, len(m.voxels()[0]))
+    return len(m.dynamic.voxels()[0]) / max(1, len(m.marginals.voxels()[0]))
 
 
 def main() -> None:
@@ -92,7 +92,7 @@ def main() -> None:
     session.run(lambda: False)
     shares = 100 * np.array(listener.dynamic)
     print(
-        f"{options.source}: {len(m.keyframes)} keyframes, {len(m.voxels()[0])} voxels, "
+        f"{options.source}: {len(m.keyframes)} keyframes, {len(m.marginals.voxels()[0])} voxels, "
         f"{len(m.dynamic.voxels()[0])} dynamic at the end ({100 * dynamic_share(m):.3f}%), on the way "
         f"{shares.mean():.3f}% in the mean and {shares.max():.3f}% at most; {len(listener.listed)} lines"
     )

@@ -72,7 +72,7 @@ def noisy_wall(m: tm.MRFMap | tm.LogOddsMap) -> dict[int, NDArray[np.float64]]:
 def marginals(m: tm.MRFMap) -> NDArray[np.float64]:
     points = np.full((len(ALONG_M), 3), VOXEL_M / 2)
     points[:, 2] = ALONG_M
-    return m.occupancy(points).astype(float)
+    return m.marginals.occupancy(points).astype(float)
 
 
 def log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -151,7 +151,7 @@ class _Place:
         if coming and self.came is not None and self.came.after is None:
             add(self.alone, frame)
             if truth.sees(standing, index):
-                could = int(truth.belong(standing, self.alone.voxels()[0], t).sum())
+                could = int(truth.belong(standing, self.alone.marginals.voxels()[0], t).sum())
                 self.came.see(could >= LEAST_VOXELS and shown >= SHOWN * could)
         if leaving and self.left is not None and self.before >= LEAST_VOXELS and truth.sees(standing, index):
             self.left.see(shown <= GONE * self.before)
@@ -214,7 +214,7 @@ def run_script(
         add(m, frame)
         if not tuning:
             add(bare, truth.frame_without_things(index))
-        occupied = m.voxels()[0]
+        occupied = m.marginals.voxels()[0]
         for place in places:
             place.follow(truth, index, frame, occupied)
         if len(swept):
@@ -234,7 +234,7 @@ def run_script(
         "trail": trail,
         "new": asdict(new),
         "drives": asdict(drives),
-        **_walls(truth, occupied, bare.voxels()[0], voxel_size),
+        **_walls(truth, occupied, bare.marginals.voxels()[0], voxel_size),
     }
 
 

@@ -64,7 +64,8 @@ class AnsweringMap(Protocol):
 
     @property
     def voxel_size(self) -> float: ...
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
+    @property
+    def marginals(self) -> Any: ...
     def state(self, points: ArrayLike) -> NDArray[np.int8]: ...
 
 
@@ -224,7 +225,8 @@ def scan_figures(m: AnsweringMap, rays: AnsweringMap, view: SceneView, seed: int
     occupied, free = points_of(view, DIAGONAL * m.voxel_size, seed)
     points = np.concatenate([occupied, free])
     truth = np.arange(len(points)) < len(occupied)
-    p, unknown, crossed = m.occupancy(points), m.state(points) == UNKNOWN, rays.state(points) != UNKNOWN
+    p = m.marginals.occupancy(points)
+    unknown, crossed = m.state(points) == UNKNOWN, rays.state(points) != UNKNOWN
     return {
         "area": score_occupancy(p, truth).roc_area,
         "crossed": score_occupancy(p[crossed], truth[crossed]).roc_area if crossed.any() else math.nan,

@@ -121,7 +121,7 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     centres, occupied = _seen(truth, scene)
     behind = _hidden(truth, m)
     maps: dict[str, MRFMap | MapReading] = {
-        "marginal": m,
+        "marginal": m.marginals,
         "occupied": m.decided,
         "calibrated": m.calibrated(),
     }

@@ -33,7 +33,11 @@ GLANCE, GLANCE_RUNS = 16, 2
 """The default noise is checked, and learnt, by so many frames, in so many runs,"""
 
 GLANCE_COST = 4
-"""of a recording that has at least so many times as many."""
+"""of a recording that has at least so many times as many. In a recording of half as many a stated noise is
+checked, too,"""
+
+FAR_OFF = 3.0
+"""and replaced if it is that many times too small."""
 
 NOISE = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
 """The parameters of noise among those of the sensor."""
@@ -151,20 +155,19 @@ def sigma_of_glance(
     limit: int | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> LearntSigma | None:
-    """The law of sigma that takes the place of the default one, if held-out frames contradict that: what one
-    map of GLANCE of the frames 0, ``every``, 2 ``every``, ..., ``limit`` of them at most, says. None, and no
-    map, if the noise is not the default; if poses are not known; if rays are so long that a law needs another
-    prior, too; or if there are so few frames that it would cost too much."""
+    """The law of sigma that takes the place of the present one, if held-out frames contradict that: what maps
+    of GLANCE of the frames 0, ``every``, 2 ``every``, ..., ``limit`` of them at most, say. A stated noise is
+    replaced only if it is far too small. None if they agree; if poses are not known; if frames have a noise
+    of their own; if the default's rays are so long that a law needs another prior, too; or if there are so
+    few frames that it would cost too much."""
     indices = range(0, len(dataset), every)[:limit] if not dataset.endless else range(0)
-    if (
-        len(indices) < GLANCE * GLANCE_COST
-        or dataset.tracked
-        or not is_default_noise(dataset, config.sensor)
-        or METHODS[config.method].section != "inference"
-    ):
+    default = is_default_noise(dataset, config.sensor)
+    count = min(GLANCE, len(indices) // GLANCE_COST)
+    too_few = count < (GLANCE if default else GLANCE // 2)
+    if too_few or dataset.tracked or METHODS[config.method].section != "inference":
         return None
-    begin, frames = time.perf_counter(), chosen(dataset, _spread(indices, GLANCE, GLANCE_RUNS))
-    if _priors(frames, config):
+    begin, frames = time.perf_counter(), chosen(dataset, _spread(indices, count, GLANCE_RUNS))
+    if default and _priors(frames, config):
         return None
     result = map_sequence(frames, _trial(config), skip_bad_frames=True, should_stop=should_stop)
     if any(keyframe.own.noise is not None for keyframe in result.map.keyframes.values()):
@@ -174,6 +177,8 @@ def sigma_of_glance(
     check = None if measured is None else checked(measured, len(parts))
     if measured is None or check is None or check.law is None:
         return None
+    if not default:
+        return learn_sigma(frames, config, should_stop=should_stop) if check.factor > FAR_OFF else None
     before, after = measured.mean(measured.sigma_m), measured.under(check.law)
     seconds = time.perf_counter() - begin
     return LearntSigma(check.law, check.frames, check.pixels, check.factor, before, after, seconds=seconds)

@@ -26,7 +26,7 @@ def run_diff(options: Diff) -> int:
         raise ConfigError(f"{options.out}: --out must end in .ply")
     runtime.init(options.arch)
     a, b = _whole(options.a), _whole(options.b)
-    found = compare_maps(a.decided, b.decided)
+    found = compare_maps(a, b)
     report = diff_report(found, str(options.a), str(options.b), a.voxel_size)
     if options.out is not None:
         report["changes"] = {

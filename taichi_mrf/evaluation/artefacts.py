@@ -94,7 +94,7 @@ def sightings(
 
     Measurements beyond ``max_depth`` metres pass voxels like all others, but need no cover.
     """
-    centres, probability = m.voxels(least_probability)
+    centres, probability = m.marginals.voxels(least_probability)
     voxels = np.floor(centres / m.voxel_size).astype(np.int32)
     bricks, brick_of = np.unique(voxels // BRICK, axis=0, return_inverse=True)
     number = np.ravel_multi_index(tuple((voxels % BRICK).T), (BRICK,) * 3)

@@ -144,7 +144,7 @@ class _Judge:
             start = time.perf_counter()
             m = self._map(made_by, **parameters)
             seconds = time.perf_counter() - start
-            marginals = m.occupancy(graph.grid.centres())  # type: ignore[union-attr]
+            marginals = m.marginals.occupancy(graph.grid.centres())  # type: ignore[union-attr]
             rows[name] = _difference(graph, marginals, reference, crossed) | {
                 "bound": None,
                 "steps": m.config.inference.sweeps,

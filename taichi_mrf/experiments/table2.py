@@ -121,7 +121,7 @@ def _truth(
 
 
 def _score(m: OccupancyMap, truth: OccupancyTruth) -> OccupancyScores:
-    found = [(m.occupancy(centres), occupied) for centres, occupied in truth.blocks()]
+    found = [(m.marginals.occupancy(centres), occupied) for centres, occupied in truth.blocks()]
     return score_occupancy(
         np.concatenate([p for p, _ in found]),
         np.concatenate([o for _, o in found]),

@@ -290,7 +290,7 @@ def write_mesh(
 
 def write_arrays(path: str | Path, m: VoxelMap) -> None:
     """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
-    reader, deciding = BrickReader(m), BrickReader(m.decided)
+    reader = BrickReader(m.decided)
     count = len(reader.bricks) * VOXELS
     check_memory(_BYTES_PER_VOXEL * count, f"{count / 1e6:.3g} million voxels as arrays")
     voxels, probabilities, states = (
@@ -298,8 +298,7 @@ def write_arrays(path: str | Path, m: VoxelMap) -> None:
         [np.zeros(0, np.float32)],
         [np.zeros(0, np.int8)],
     )
-    for bricks, log_odds, _ in reader.batches(reader.bricks):
-        state = deciding.state(deciding.log_odds(bricks))
+    for bricks, log_odds, state in reader.batches(reader.bricks):
         row, number = np.nonzero(state != UNKNOWN)
         voxels.append(bricks[row] * BRICK + offsets_in_brick()[number])
         probabilities.append(probability(log_odds[row, number]))

@@ -184,14 +184,19 @@ class BrickMap(Owned):
 
     @tensors.in_kind("points", on_device=True)
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
-        measured."""
-        return probability(self._log_odds(points))
+        """Probability of occupied at (N, 3) points in metres, (N,) float32, that of :attr:`decided`; the
+        prior where nothing was measured."""
+        return probability(self.decided._log_odds(points))
 
     @property
     def decided(self) -> Any:
         """The map whose log-odds decide which voxels are occupied: this one, unless the method overrides
         it."""
+        return self
+
+    @property
+    def marginals(self) -> Any:
+        """The map by its own log-odds alone: this one, unless the method overrides it."""
         return self
 
     @tensors.in_kind("points", on_device=True)
@@ -201,8 +206,10 @@ class BrickMap(Owned):
         return classify(log_odds, self._pool.prior_log_odds, self.view.volume.min_evidence)
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
-        return extract.extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
+        """All allocated voxels of at least this probability, that of :attr:`decided`: centres (N, 3) in
+        metres, and (N,)."""
+        least, pool = real(min_probability, "min_probability"), self.decided._pool
+        return extract.extract_voxels(pool, self.voxel_size, least)
 
     @tensors.in_kind("T_world_camera")
     def render_depth(

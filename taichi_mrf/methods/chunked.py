@@ -60,16 +60,17 @@ def _voxels_of(points: ArrayLike, voxel_size: float) -> NDArray[np.int64]:
     return np.clip(np.floor(checked_points(points) / voxel_size), -(2**30), 2**30).astype(np.int64)
 
 
-LogOdds = Literal["marginal", "decided", "calibrated"]
-"""Kind of a chunked map's log-odds: the marginals', those of what is occupied, or those that can be trusted
-as probabilities."""
+LogOdds = Literal["stored", "marginal", "decided", "calibrated"]
+"""Kind of a chunked map's log-odds: as they are stored, the marginals', which questions are answered by what
+is occupied from; the marginals' alone; those of what is occupied; or those that can be trusted as
+probabilities."""
 
 
 class ChunkedMap:
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
-    def __init__(self, store: ChunkStore, cache_mb: float = 256.0, by: LogOdds = "marginal") -> None:
+    def __init__(self, store: ChunkStore, cache_mb: float = 256.0, by: LogOdds = "stored") -> None:
         """Raises ConfigError for a cache smaller than one chunk."""
         self._by = by
         if not real(cache_mb, "cache_mb") * 1e6 >= CHUNK_BYTES:
@@ -92,14 +93,21 @@ class ChunkedMap:
     @property
     def holds_marginals(self) -> bool:
         """True if the log-odds are those of the marginals."""
-        return self._by == "marginal"
+        return self._by in ("stored", "marginal")
 
     @cached_property
     def decided(self) -> "ChunkedMap":
         """The map by what is occupied, as MRFMap.decided; itself if the store holds no votes of rays."""
-        if self._by != "marginal" or FIRST not in self.store.layers:
+        if self._by != "stored" or FIRST not in self.store.layers:
             return self
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "decided")
+
+    @cached_property
+    def marginals(self) -> "ChunkedMap":
+        """The map by its marginals alone, as MRFMap.marginals."""
+        if self.decided is self:
+            return self
+        return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "marginal")
 
     def calibrated(self) -> "ChunkedMap":
         """The map of calibrated probabilities, as MRFMap.calibrated. Raises ConfigError if the store does not
@@ -141,10 +149,13 @@ class ChunkedMap:
 
     @tensors.in_kind("points")
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nothing was observed.
+        """Log-odds of occupied at (N, 3) points in metres, (N,), by what is :attr:`decided`; the prior where
+        nothing was observed.
 
         Raises ConfigError for points of another shape or that are not finite.
         """
+        if self.decided is not self:
+            return self.decided.log_odds(points)
         voxels = _voxels_of(points, self.voxel_size)
         out = np.full(len(voxels), self.header.prior_log_odds, np.float32)
         for chunk, rows in self._by_chunk(voxels):
@@ -171,13 +182,16 @@ class ChunkedMap:
     @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        return self._state(self.decided.log_odds(points))
+        return self._state(self.log_odds(points))
 
     def box(self, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
-        """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays.
+        """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays, by what
+        is :attr:`decided`.
 
         Raises ConfigError for corners that make no box, CapacityError if there is not enough memory.
         """
+        if self.decided is not self:
+            return self.decided.box(lower, upper)
         first, after = voxels_of_box(lower, upper, self.voxel_size)
         shape = after - first
         voxels = float(np.prod(shape.astype(np.float64)))
@@ -187,8 +201,7 @@ class ChunkedMap:
             place = tuple(slice(b, b + n) for b, n in zip(begin - first, block.shape, strict=True))
             log_odds[place] = np.where(np.isnan(block), self.header.prior_log_odds, block)
         x, y, z = first.tolist()
-        state = self._state(log_odds) if self.decided is self else self.decided.box(lower, upper).state
-        return BoxOfVoxels(log_odds, state, (x, y, z), self.voxel_size)
+        return BoxOfVoxels(log_odds, self._state(log_odds), (x, y, z), self.voxel_size)
 
     def voxels(
         self,
@@ -196,13 +209,15 @@ class ChunkedMap:
         upper: ArrayLike | None = None,
         min_probability: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Observed voxels of at least this probability in a box (default: the whole map): centres (N, 3) in
-        metres, and probabilities (N,).
+        """Observed voxels of at least this probability, by what is :attr:`decided`, in a box (default: the
+        whole map): centres (N, 3) in metres, and probabilities (N,).
 
         Raises ConfigError for a probability outside [0, 1] and for corners that make no box.
         """
         if not 0 <= min_probability <= 1:
             raise ConfigError(f"min_probability must lie between 0 and 1, not {min_probability}")
+        if self.decided is not self:
+            return self.decided.voxels(lower, upper, min_probability)
         centres: list[NDArray[np.float64]] = [np.zeros((0, 3))]
         found = [np.zeros(0, np.float32)]
         if len(self.chunks):

@@ -110,6 +110,14 @@ class MapPart:
         return take_part(by_votes, self.lowest * brick_m, self.after * brick_m)
 
     @cached_property
+    def marginals(self) -> "MapPart":
+        """The part by its marginals alone, as MRFMap.marginals."""
+        alone, brick_m = self.source.marginals, BRICK * self.voxel_size
+        if alone is self.source:
+            return self
+        return take_part(alone, self.lowest * brick_m, self.after * brick_m)
+
+    @cached_property
     def _likely(self) -> "MapPart":
         """The part by which voxels have their states where the map holds what rays measured, else itself."""
         return self.decided if self.source.holds_marginals and self.has_surface else self

@@ -63,11 +63,12 @@ class BoxOfVoxels:
 
 
 def read_box(m: VoxelMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
-    """The voxels that a box reaches into, from corner ``lower`` to corner ``upper``, (3,) in metres.
+    """The voxels that a box reaches into, from corner ``lower`` to corner ``upper``, (3,) in metres, by what
+    is ``decided`` in the map.
 
     Raises ConfigError for corners that make no box, CapacityError if it holds more voxels than fit memory.
     """
-    return voxel_box(m, *voxels_of_box(lower, upper, m.voxel_size))
+    return voxel_box(m.decided, *voxels_of_box(lower, upper, m.voxel_size))
 
 
 def map_extent(m: VoxelMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -100,16 +101,13 @@ def voxels_of_box(
 def voxel_box(
     m: VoxelMap, first: NDArray[np.int64], after: NDArray[np.int64], reader: BrickReader | None = None
 ) -> BoxOfVoxels:
-    """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each.
-
-    ``reader`` saves time where many boxes of the same map are read; states are then those of its log-odds.
-    Raises CapacityError.
+    """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each, by the map's own
+    log-odds. ``reader`` saves time where many boxes of the same map are read. Raises CapacityError.
     """
     lowest, highest = first // BRICK, (after - 1) // BRICK
     shape = highest - lowest + 1
     voxels = float(np.prod(shape.astype(np.float64))) * BRICK**3
     check_memory(_BYTES_PER_VOXEL * voxels, f"a box of {voxels / 1e6:.3g} million voxels")
-    whole = reader is None
     reader = BrickReader(m) if reader is None else reader
     values = reader.log_odds(bricks_between(lowest, highest))
     in_order = values.reshape(*shape, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
@@ -117,11 +115,7 @@ def voxel_box(
     cut = tuple(slice(int(b), int(e)) for b, e in zip(begin, end, strict=True))
     log_odds = np.ascontiguousarray(in_order.reshape(shape * BRICK)[cut])
     x, y, z = first.tolist()
-    if whole and m.decided is not m:
-        state = voxel_box(m.decided, first, after).state
-    else:
-        state = reader.state(log_odds)
-    return BoxOfVoxels(log_odds, state, (x, y, z), m.voxel_size)
+    return BoxOfVoxels(log_odds, reader.state(log_odds), (x, y, z), m.voxel_size)
 
 
 Axis = Literal["x", "y", "z"]
@@ -184,7 +178,7 @@ def slice_map(
     first, after = voxels_of_box(low, high, m.voxel_size)
     first[number] = np.floor(np.clip(place_m / m.voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL))
     after[number] = first[number] + 1
-    found = voxel_box(m, first, after)
+    found = voxel_box(m.decided, first, after)
     left_right = float(found.lower_m[across]), float(found.upper_m[across])
     bottom_top = float(found.lower_m[upwards]), float(found.upper_m[upwards])
 

@@ -69,9 +69,10 @@ def compare_maps(a: VoxelMap, b: VoxelMap, bricks: Bricks | None = None) -> MapC
     """Compare two maps over all space known in either, including free space without voxels; or only in
     ``bricks``, (n, 3) coordinates.
 
-    States are those of the maps' own log-odds: give ``m.decided`` to compare what is occupied. The maps can
-    be of different methods. Raises ConfigError if their voxels are of different sizes.
+    States and probabilities are by what is ``decided`` in each; ``m.marginals`` compares marginals. The maps
+    can be of different methods. Raises ConfigError if their voxels are of different sizes.
     """
+    a, b = a.decided, b.decided
     if a.config.volume.origin != b.config.volume.origin:
         raise ConfigError(
             "maps with different origins in the recorded world cannot be compared: "

@@ -80,7 +80,8 @@ def marginals_behind(m: VoxelMap, points: ArrayLike, normals: ArrayLike) -> NDAr
     """The likeliest marginal at or half a voxel behind points (N, 3) of a surface, in metres: (N,)."""
     places = np.asarray(points, np.float64)
     behind = places - 0.5 * m.voxel_size * np.asarray(normals)
-    return np.maximum(m.occupancy(places), m.occupancy(behind))
+    by_marginals = m.marginals
+    return np.maximum(by_marginals.occupancy(places), by_marginals.occupancy(behind))
 
 
 def _blended(m: VoxelMap, points: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -137,7 +137,7 @@ def _free_without_voxels(m: VoxelMap, reader: BrickReader, lower: Bricks, upper:
 
 def _log_odds_at(m: VoxelMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Log-odds of a map at points (N, 3) without voxels, which votes of rays say nothing of: (N,)."""
-    p = np.maximum(m.occupancy(points_m).astype(np.float64), _LEAST_PROBABILITY)
+    p = np.maximum(m.marginals.occupancy(points_m).astype(np.float64), _LEAST_PROBABILITY)
     return np.asarray(np.log(p / (1 - p)))
 
 

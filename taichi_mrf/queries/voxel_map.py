@@ -62,8 +62,13 @@ class VoxelMap(Protocol):
         exported, but not changed."""
         ...
 
+    @property
+    def marginals(self) -> Any:
+        """The map by its marginals alone, perhaps this one: for queries and exports, as ``decided``."""
+        ...
+
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32."""
+        """Probability of occupied at (N, 3) points in metres, (N,) float32, by what is ``decided``."""
         ...
 
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
@@ -71,7 +76,7 @@ class VoxelMap(Protocol):
         ...
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
+        """Voxels of at least this probability, by what is ``decided``: centres (N, 3) in metres, and (N,)."""
         ...
 
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:

@@ -203,7 +203,7 @@ class ChangeList:
             self._next = 0.0
             return []
         before = m.layer(stamp_s=before_s)
-        change = compare_maps(before, m, self._seen_since(before_s))
+        change = compare_maps(before, m.marginals, self._seen_since(before_s))
         change = without_slack(change, before, m, core=self._least)
         things = find_changed_things(change, m.voxel_size, self._least, max(REACH_M, m.voxel_size))
         seconds = time.monotonic() - begin

@@ -51,13 +51,13 @@ class VoxelTruth:
         self._known: dict[float, OccupancyTruth] = {}
 
     def calibration_error(self, m: OccupancyMap) -> float:
-        """Expected calibration error of a map's probabilities over the voxels whose truth is known."""
+        """Expected calibration error of a map's marginals over the voxels whose truth is known."""
         probability: list[NDArray[np.float32]] = []
         occupied: list[NDArray[np.bool_]] = []
         known = self._at(m.voxel_size)
         step = -(-sum(known.counts) // MOST_VOXELS)
         for centres, truth in known.blocks():
-            probability.append(m.occupancy(centres[::step]))
+            probability.append(m.marginals.occupancy(centres[::step]))
             occupied.append(truth[::step])
         if not probability:
             return float("nan")

@@ -221,10 +221,10 @@ def test_a_loaded_map_can_be_refined(tmp_path: object) -> None:
 def test_the_map_of_others_is_what_they_believe() -> None:
     """Of a map of one keyframe nothing is left but the prior; afterwards it is as it was."""
     m = build([0])
-    centres, before = m.voxels(min_probability=0.0)
+    centres, before = m.marginals.voxels(min_probability=0.0)
     assert (np.abs(before - m.prior) > 0.05).mean() > 0.05
     with map_of_others(m.view, m.keyframes[0]):
-        np.testing.assert_allclose(m.occupancy(centres), m.prior, atol=1e-5)
+        np.testing.assert_allclose(m.marginals.occupancy(centres), m.prior, atol=1e-5)
         alone = log_likelihood(m.view, m.keyframes[0], frames()[0].T_world_camera, 10.0)
-    np.testing.assert_array_equal(m.occupancy(centres), before)
+    np.testing.assert_array_equal(m.marginals.occupancy(centres), before)
     assert log_likelihood(m.view, m.keyframes[0], frames()[0].T_world_camera, 10.0) > alone + 1

@@ -128,12 +128,13 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
 
 
 @pytest.mark.usefixtures("one_backend")
-def test_only_a_default_noise_of_a_long_recording_is_doubted(
+def test_a_default_noise_of_a_long_recording_is_doubted_and_a_stated_one_that_is_far_off(
     room: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = Config(VOXEL)
     assert sigma_of_glance(room, config) is None, "12 frames are too few"
-    monkeypatch.setattr(from_recording, "GLANCE_COST", 0)
+    monkeypatch.setattr(from_recording, "GLANCE_COST", 1)
+    monkeypatch.setattr(from_recording, "GLANCE", 12)
     assert sigma_of_glance(room, config) is None, "its noise is the default"
     noisy = Noisy(room.name, room.camera, source=room)
     learnt = sigma_of_glance(noisy, config)
@@ -141,8 +142,13 @@ def test_only_a_default_noise_of_a_long_recording_is_doubted(
     assert learnt.after > learnt.before
     sigma_m = learnt.law.scale * np.polynomial.polynomial.polyval(2.0, SensorConfig().sigma)
     assert 0.1 / CLOSE < sigma_m + learnt.law.added_m < 0.1 * CLOSE
-    stated = replace(config, sensor=SensorConfig(sigma=(0.001,)))
-    assert sigma_of_glance(noisy, stated) is None, "the user has said what it is"
+    near = replace(config, sensor=SensorConfig(sigma=(0.05,)))
+    assert sigma_of_glance(noisy, near) is None, "the user has said what it is"
+    far_off = replace(config, sensor=SensorConfig(sigma=(0.02,)))
+    learnt = sigma_of_glance(noisy, far_off)
+    assert learnt is not None
+    assert 3 * 0.02 < learnt.law.scale * 0.02 + learnt.law.added_m < 0.1 * CLOSE
+    assert sigma_of_glance(chosen(noisy, range(5)), far_off) is None, "5 frames are too few"
     dense = replace(config, inference=InferenceConfig(surface_density=20.0))
     assert sigma_of_glance(noisy, dense) is None, "rays are long for such a prior"
     assert sigma_of_glance(noisy, replace(config, method="log_odds")) is None

@@ -22,7 +22,7 @@ def test_a_map_is_exported_by_what_is_occupied(tmp_path: Path) -> None:
         centres = (file["voxels"] + 0.5) * float(file["voxel_size"])
         np.testing.assert_array_equal(file["state"], m.state(centres))
         np.testing.assert_array_equal(file["probability"], m.occupancy(centres))
-    assert (m.state(centres) != m.layer().state(centres)).any()
+    assert (m.state(centres) != m.marginals.state(centres)).any()
 
 
 def test_a_run_writes_the_occupied_voxels(tmp_path: Path) -> None:
@@ -31,6 +31,6 @@ def test_a_run_writes_the_occupied_voxels(tmp_path: Path) -> None:
     assert carry_out("map", room, "--out", tmp_path / "run", "--voxel-size", 0.2, *flags) == 0
     assert (tmp_path / "run" / "surface.png").stat().st_size > 0
     m = load_map(tmp_path / "run" / "map.npz")
-    called = len(m.decided.voxels()[0])
-    assert called > len(m.voxels()[0])
+    called = len(m.voxels()[0])
+    assert called > len(m.marginals.voxels()[0])
     assert f"element vertex {called}\n".encode() in (tmp_path / "run" / "voxels.ply").read_bytes()

@@ -109,7 +109,7 @@ def test_table2_holds_probabilities_against_the_mesh(second: tuple, data: Path) 
     m = mrf_map(scene, SIZE, KEYFRAMES)
     centres = [(voxels.astype(np.float64) + 0.5) * SIZE for voxels in (truth.occupied(), truth.free())]
     occupied = np.repeat([True, False], [len(each) for each in centres])
-    scores = score_occupancy(m.occupancy(np.concatenate(centres)), occupied)
+    scores = score_occupancy(m.marginals.occupancy(np.concatenate(centres)), occupied)
     row = row_of(tables[2], "MRFMap")
     expected = (scores.precision, scores.recall, scores.roc_area, scores.brier, scores.calibration_error)
     assert [row[name] for name in OCCUPANCY] == pytest.approx([*expected, scores.occupied, scores.count])

@@ -173,7 +173,7 @@ def test_any_history_of_dated_keyframes_ends_in_the_same_map(history: list[tuple
 def test_the_map_of_another_time_holds_the_keyframes_up_to_then() -> None:
     m = dated_room([0, 1, 2, 3])
     assert m.now_s == 3 * STEP_S
-    centres, p = m.voxels(0.0)
+    centres, p = m.marginals.voxels(0.0)
     np.testing.assert_allclose(m.at(m.now_s).occupancy(centres), p, atol=0.01)
     first = m.at(0.0)
     by_first = m.keyframes[0]
@@ -182,10 +182,10 @@ def test_the_map_of_another_time_holds_the_keyframes_up_to_then() -> None:
     assert len(unseen)
     assert (first.view.pool.read("belief", unseen) == pool.prior_log_odds).all()
     assert len(m.at(-1.0).voxels(0.5)[0]) == 0
-    assert len(first.voxels(0.5)[0]) > 100
+    assert len(first.marginals.voxels(0.5)[0]) > 100
     m.remove_keyframe(0)
     with pytest.raises(KeyframeError, match="has changed"):
-        first.occupancy(centres)
+        first.marginals.occupancy(centres)
 
 
 @pytest.mark.usefixtures("backend")

@@ -251,7 +251,7 @@ def test_surfaces_that_others_measured_stay() -> None:
     add(m, 0)
     for each in (plain, m):
         each.infer()
-    wall, _ = plain.voxels(0.8)
+    wall, _ = plain.marginals.voxels(0.8)
     assert len(wall) > 200
     assert (m.state(wall) == OCCUPIED).mean() > 0.99
 

@@ -102,7 +102,7 @@ def test_a_wall_that_no_voxel_is_sure_of_stops_rays() -> None:
     called = found.point[found.hit] + [0, 0, VOXEL / 2]
     assert (m.state(called) == OCCUPIED).all()
     np.testing.assert_array_equal(surface.state(called), m.state(called))
-    assert len(surface.voxels()[0]) > len(m.voxels()[0])
+    assert len(surface.marginals.voxels()[0]) > len(m.marginals.voxels()[0])
 
 
 def test_what_marginals_call_occupied_stays_so() -> None:

@@ -57,7 +57,9 @@ ALWAYS = np.ones(len(STEPS_M), bool)
 def test_a_post_thinner_than_a_voxel_is_occupied_and_in_the_way() -> None:
     m = mapped(ALWAYS)
     m.infer()
-    assert (m.occupancy(post_points()) < 0.05).all()  # the rays that pass beside it outvote those that end
+    assert (
+        m.marginals.occupancy(post_points()) < 0.05
+    ).all()  # the rays that pass beside it outvote those that end
     assert (m.state(post_points()) == OCCUPIED).all()
     beside = np.add(post_points(), (0.1, 0.0, 0.0))
     assert (m.state(beside) == FREE).all()
@@ -191,7 +193,7 @@ def test_just_before_a_larger_surface_a_post_makes_a_voxel_unknown() -> None:
         m.add_keyframe(depth_image(x_m, post_m=post_m), pose(x_m), CAMERA, f"{i}", float(i))
     m.infer()
     points = np.add(post_points(), (0.0, 0.0, post_m - POST_M))
-    assert (m.occupancy(points) < 0.05).all()
+    assert (m.marginals.occupancy(points) < 0.05).all()
     assert not np.isin(m.state(points), (FREE, OCCUPIED)).any()
 
 

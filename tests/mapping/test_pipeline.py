@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 def marginals(m: MRFMap) -> dict[tuple[float, ...], float]:
-    centres, probability = m.voxels(min_probability=0.0)
+    centres, probability = m.marginals.voxels(min_probability=0.0)
     return {tuple(np.round(c, 4)): float(p) for c, p in zip(centres, probability, strict=True)}
 
 

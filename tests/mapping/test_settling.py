@@ -23,7 +23,7 @@ KEYFRAMES = 3
 
 
 def marginals(m: MRFMap | LogOddsMap) -> NDArray[np.float32]:
-    return m.occupancy(small_room.probes())
+    return m.marginals.occupancy(small_room.probes())
 
 
 def incremental() -> MRFMap:
@@ -127,7 +127,7 @@ def test_what_is_decided_while_a_map_settles_is_what_was_decided_before() -> Non
         m.add_keyframe(depth_m.astype(np.float32), T_world_camera, camera)
     m.infer()
     wanted = m.decided.voxels(0.5)[0]
-    assert len(wanted) > 3 * len(m.voxels(0.5)[0])
+    assert len(wanted) > 3 * len(m.marginals.voxels(0.5)[0])
     with FullInference(m, keep_before=True) as inference:
         next(iter(inference))
         with inference.showing_before():

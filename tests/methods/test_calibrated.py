@@ -128,7 +128,7 @@ def test_bricks_beside_the_fields_own_follow_the_formula(monkeypatch: pytest.Mon
 def test_an_uncertain_wall_is_where_it_was_measured() -> None:
     m = uncertain_wall()
     centres, p = m.calibrated().voxels()
-    assert len(centres) > 3 * len(m.voxels()[0])
+    assert len(centres) > 3 * len(m.marginals.voxels()[0])
     assert (np.abs(centres[:, 2] - WALL_M) < 1.5 * VOXEL).mean() > 0.8
     assert p.max() <= 1
     assert p.min() > 0.5

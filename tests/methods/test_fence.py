@@ -97,7 +97,7 @@ def test_posts_stay_in_voxels_wider_than_they_are_more_so_if_rays_may_pass() -> 
         m = mapped(0.1, pass_through)
         posts, gaps = (m.state(post_points(aside)) for aside in (0.0, 0.5 * GAP_M))
         shares[pass_through] = (posts == OCCUPIED).mean()
-        likelier[pass_through] = (m.occupancy(post_points()) > 0.5).mean()
+        likelier[pass_through] = (m.marginals.occupancy(post_points()) > 0.5).mean()
         assert (gaps == FREE).mean() > 0.9
         assert not (posts == FREE).any()
     assert shares[0.1] > 0.9

@@ -43,7 +43,7 @@ def test_a_layer_is_one_call() -> None:
     probes = small_room.probes()
     static, dynamic, both = (m.layer(which) for which in LAYERS)
     for named, read in ((m.static, static), (m.dynamic, dynamic), (m, both)):
-        np.testing.assert_array_equal(named.occupancy(probes), read.occupancy(probes))
+        np.testing.assert_array_equal(named.marginals.occupancy(probes), read.marginals.occupancy(probes))
     occupied = {which: m.layer(which).state(probes) == OCCUPIED for which in LAYERS}
     assert not (occupied["static"] & occupied["dynamic"]).any()
     assert (occupied["static"] | occupied["dynamic"])[occupied["both"]].all()
@@ -77,7 +77,7 @@ def test_layers_that_there_are_not() -> None:
     for ask in (lambda: static.layer("dynamic"), lambda: static.changes(0.0)):
         with pytest.raises(ConfigError, match=r"set time\.half_life_s"):
             ask()
-    np.testing.assert_array_equal(static.layer("both").voxels()[0], static.voxels()[0])
+    np.testing.assert_array_equal(static.layer("both").voxels()[0], static.marginals.voxels()[0])
 
 
 def test_every_format_of_a_layer(tmp_path: Path) -> None:
@@ -224,7 +224,7 @@ def test_unknown_space_is_no_contradiction() -> None:
 def test_rays_have_no_votes_for_what_is_gone() -> None:
     m = room_that_changed(ball_comes=False)
     reading = m.decided
-    centres = reading.voxels()[0]
-    assert len(centres) > len(m.voxels()[0])
+    centres = reading.marginals.voxels()[0]
+    assert len(centres) > len(m.marginals.voxels()[0])
     assert near_ball(m.at(BEFORE_S).voxels()[0]).any()
     assert not near_ball(centres).any()

@@ -120,12 +120,12 @@ def test_a_map_moves_rigidly_with_its_keyframes(
 def test_adding_and_removing_gives_back_the_map() -> None:
     m = small_room.build([0, 1, 2])
     probes = small_room.probes()
-    before, states, size = m.occupancy(probes), m.state(probes), m.statistics()
+    before, states, size = m.marginals.occupancy(probes), m.state(probes), m.statistics()
     k = small_room.add(m, small_room.frames()[5])
     m.infer(sweeps=2, keyframes=[k])
-    assert np.abs(m.occupancy(probes) - before).max() > 0.5
+    assert np.abs(m.marginals.occupancy(probes) - before).max() > 0.5
     m.remove_keyframe(k)
-    np.testing.assert_allclose(m.occupancy(probes), before, atol=1e-5)
+    np.testing.assert_allclose(m.marginals.occupancy(probes), before, atol=1e-5)
     np.testing.assert_array_equal(m.state(probes), states)
     assert m.statistics().bricks == size.bricks
 
@@ -167,15 +167,15 @@ def test_adding_and_removing_again_and_again_takes_no_memory() -> None:
 def test_freezing_keeps_the_map_and_forgets_the_image() -> None:
     m = small_room.build([0, 1, 2])
     probes = small_room.probes()
-    before, states = m.occupancy(probes), m.state(probes)
+    before, states = m.marginals.occupancy(probes), m.state(probes)
     (first, *others) = m.keyframes
     m.freeze_keyframe(first)
-    np.testing.assert_array_equal(m.occupancy(probes), before)
+    np.testing.assert_array_equal(m.marginals.occupancy(probes), before)
     np.testing.assert_array_equal(m.state(probes), states)
     assert first not in m.keyframes
     assert first in m.frozen
     m.infer()
-    assert (np.abs(m.occupancy(probes) - before) <= 0.01).mean() >= 0.999
+    assert (np.abs(m.marginals.occupancy(probes) - before) <= 0.01).mean() >= 0.999
     with pytest.raises(KeyframeError, match="frozen"):
         m.remove_keyframe(first)
     for k in others:  # bricks that only the frozen keyframe wants stay

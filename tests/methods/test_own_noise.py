@@ -92,7 +92,7 @@ def test_messages_equal_those_of_numpy_with_a_noise_for_each_ray(seed: int) -> N
     prior = prior_probability(config, VOXEL)
     expected = reference.infer([rays], allocated(m), prior, config, ExactMap.LIMITS)
     p = np.array([reference.logistic(x) for x in expected.values()])
-    found = m.occupancy((np.array(list(expected)) + 0.5) * VOXEL)
+    found = m.marginals.occupancy((np.array(list(expected)) + 0.5) * VOXEL)
     assert np.mean(np.abs(found - p) < 1e-3) > 0.98  # float32 may take the other way round a corner
 
 

@@ -32,13 +32,13 @@ def shifted(number: int, *tangent: float) -> np.ndarray:
 
 def near_share(a: MRFMap, b: MRFMap) -> float:
     """Share of the voxels of ``b`` whose probability in ``a`` differs by no more than 0.02."""
-    centres, p = b.voxels(0.0)
-    return float((np.abs(a.occupancy(centres) - p) <= 0.02).mean())
+    centres, p = b.marginals.voxels(0.0)
+    return float((np.abs(a.marginals.occupancy(centres) - p) <= 0.02).mean())
 
 
 def assert_same(a: MRFMap, b: MRFMap) -> None:
     """Equal voxels and equal probabilities, bit for bit."""
-    (centres, p), (others, q) = a.voxels(0.0), b.voxels(0.0)
+    (centres, p), (others, q) = a.marginals.voxels(0.0), b.marginals.voxels(0.0)
     order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
     np.testing.assert_array_equal(centres[order], others[other_order])
     np.testing.assert_array_equal(p[order], q[other_order])

@@ -13,8 +13,9 @@ from taichi_mrf.queries.frontiers import find_frontiers
 def by_search(m: HandMap, voxel_size: float) -> dict[tuple[int, ...], int]:
     """Frontier voxels with the number of their cluster, found by flooding."""
     lower, upper = map_extent(m)
-    found = read_box(m, lower - 2 * voxel_size, upper + 2 * voxel_size)
-    state, prior, least = found.state, m.view.pool.prior_log_odds, m.view.volume.min_evidence
+    around = lower - 2 * voxel_size, upper + 2 * voxel_size
+    found, state = read_box(m.marginals, *around), read_box(m, *around).state
+    prior, least = m.view.pool.prior_log_odds, m.view.volume.min_evidence
     occupied = (found.log_odds > 0) & (np.abs(found.log_odds - prior) > least)
     explored = occupied | (found.log_odds < prior - least)  # by the marginals, whatever its state is
     frontier = set()

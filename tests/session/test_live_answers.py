@@ -66,7 +66,7 @@ def test_what_keyframes_say_of_a_voxel_adds_up_to_its_log_odds() -> None:
     link = FakeLink()
     session = session_of(link)
     m = finished(session)
-    points, _ = m.voxels(0.5)
+    points, _ = m.marginals.voxels(0.5)
     for point in points[:: len(points) // 5]:
         link.ask(RayThrough(tuple(point.tolist()), (0.0, 0.0, 1.0), None))
         finished(session)
@@ -75,7 +75,7 @@ def test_what_keyframes_say_of_a_voxel_adds_up_to_its_log_odds() -> None:
         assert answer.point == tuple(point)
         strengths = [abs(log_odds) for _, log_odds in answer.votes]
         assert strengths == sorted(strengths, reverse=True)
-        p = m.occupancy([point])[0]
+        p = m.marginals.occupancy([point])[0]
         total = m.view.pool.prior_log_odds + sum(log_odds for _, log_odds in answer.votes)
         assert total == pytest.approx(np.log(p / (1 - p)), abs=0.02)  # messages are float16
     strongest = answer.votes[0][0]

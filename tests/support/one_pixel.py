@@ -64,7 +64,7 @@ def allocated(m: MRFMap) -> set[reference.Voxel]:
 
 
 def marginals(m: MRFMap, voxels: list[reference.Voxel]) -> np.ndarray:
-    return m.occupancy((np.array(voxels) + 0.5) * VOXEL).astype(np.float64)
+    return m.marginals.occupancy((np.array(voxels) + 0.5) * VOXEL).astype(np.float64)
 
 
 def well_cut(rays: list[reference.Ray], longest: int) -> bool:

@@ -47,6 +47,10 @@ class HandMap:
     def decided(self) -> "HandMap":
         return self
 
+    @property
+    def marginals(self) -> "HandMap":
+        return self
+
     def __post_init__(self) -> None:
         self.view = View(self.hand.pool, self.voxel_size, VolumeConfig(min_evidence=MIN_EVIDENCE))
         self.hand.topology.add_crossings(self.crossed, 1)

@@ -84,7 +84,7 @@ def test_the_map_on_the_page_is_that_of_the_last_try() -> None:
     session, link = run(script(Try(with_density(6.0))))
     direct = run_trial(with_density(6.0), session.frames)
     assert direct is not None
-    occupied = len(direct.map.voxels(0.5)[0])
+    occupied = len(direct.map.marginals.voxels(0.5)[0])
     assert len(shown(link.sent).voxels()) == occupied
     first = next(i for i, u in enumerate(link.sent) if isinstance(u, Bricks)) + 1
     assert len(shown(link.sent[:first]).voxels()) != occupied
@@ -100,7 +100,7 @@ def test_a_map_on_the_same_grid_takes_the_place_of_the_one_before_without_a_new_
     bricks = {len(shown(link.sent[:i]).bricks.get("map", ())) for i in range(len(link.sent))}
     assert len(bricks) > 2  # some are gone, too
     assert len(shown(link.sent).bricks["map"]) == direct.map.statistics().bricks
-    assert len(shown(link.sent).voxels()) == len(direct.map.voxels(0.5)[0])
+    assert len(shown(link.sent).voxels()) == len(direct.map.marginals.voxels(0.5)[0])
 
 
 def test_newer_parameters_end_a_try_at_once_and_the_latest_wins() -> None:

@@ -71,7 +71,7 @@ def _bricks_of(
     chunks = np.unique(np.concatenate([known_bricks(single) // CHUNK, merged.chunks]), axis=0)
     for chunk in chunks:
         side = BRICK * CHUNK * single.voxel_size
-        block = merged.box(chunk * side, (chunk + 1) * side).log_odds
+        block = merged.marginals.box(chunk * side, (chunk + 1) * side).log_odds
         values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
         yield (np.indices((CHUNK,) * 3).reshape(3, -1).T + chunk * CHUNK).astype(np.int32), values
 

@@ -81,9 +81,9 @@ def lost_result(experiment: Experiment, case: str, config: Config) -> Result:
     before = map_figures(m, walk, track.poses(m))
     m.infer()  # judging has added views and taken them away
     error_before = _errors_m(track.poses(m), walk.frames, 0)[-1]
-    marginals = m.voxels(0.0)
+    marginals = m.marginals.voxels(0.0)
     _offer(intake, covered, BEFORE)
-    centers, probability = m.voxels(0.0)
+    centers, probability = m.marginals.voxels(0.0)
     kept = np.array_equal(centers, marginals[0]) and np.array_equal(probability, marginals[1])
     found_covered = sum(index >= BEFORE for index in track.frames)
     _offer(intake, after, BEFORE + COVERED)

@@ -166,4 +166,4 @@ def _answers(judged: JudgedView) -> Answers:
 
 def _cells(m: Any, points_m: NDArray[np.float64]) -> Cells:
     state = m.state(points_m)
-    return Cells(m.occupancy(points_m), state == OCCUPIED, state == FREE)
+    return Cells(m.marginals.occupancy(points_m), state == OCCUPIED, state == FREE)

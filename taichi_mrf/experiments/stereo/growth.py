@@ -140,7 +140,7 @@ def grow(contender: Contender, scene: Scene, voxel_size: float, updates: int, ev
     for count in range(1, updates + 1):
         m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
         if count == 1 or count % every == 0:
-            centres, probability = m.voxels(0.5)
+            centres, probability = m.marginals.voxels(0.5)
             counts.append(count)
             farthest.append(_reach(centres[probability > 0.5], view.T_world_camera[:3, 3]))
     return {"updates": counts, "farthest_m": farthest}
@@ -206,7 +206,7 @@ def time_mapping(contender: Contender, scene: Scene, voxel_size: float, views: i
     return {
         "seconds": statistics.median(seconds),
         "mb": size.bytes_per_voxel * size.voxels / 1e6,
-        "voxels": len(m.voxels(0.0)[0]),
+        "voxels": len(m.marginals.voxels(0.0)[0]),
     }
 
 

@@ -411,11 +411,9 @@ class MRFMap(BrickMap):
         return self._parts.now_s
 
     def at(self, stamp_s: float) -> "reading.MapReading":
-        """The map as of a time in seconds, from the keyframes up to then.
-
-        Frozen keyframes count from the time of the newest of them on. Messages are the present ones, which
-        depend on later keyframes too. Raises ConfigError in a map of a static world (``time.half_life_s`` is
-        0), where keyframes have no order.
+        """The map by its marginals as of a time in seconds, from the keyframes up to then. Frozen keyframes
+        count from the time of the newest of them on. Messages are the present ones, which depend on later
+        keyframes too. Raises ConfigError in a map of a static world (``time.half_life_s`` is 0).
         """
         return self.layer("both", stamp_s)
 
@@ -441,15 +439,14 @@ class MRFMap(BrickMap):
 
     @property
     def decided(self) -> "reading.MapReading":
-        """The map with a decision for each voxel, for queries, ray casts, pictures and exports; :meth:`state`
-        uses it.
+        """The map with a decision for each voxel, for ray casts, pictures and exports; :meth:`state`,
+        :meth:`occupancy` and :meth:`voxels` use it.
 
         Voxels are occupied if their marginal is over one half, or if they win the vote of the rays: each
         measured ray votes for its most likely first surface, and against the voxels in front of it
-        (inference.surface_votes). Votes find walls seen with a sigma of several voxels, where no marginal is
-        over one half. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the states allow, if
-        the map is settled and has a surface; otherwise the marginals', with those of winners raised to just
-        above even odds. Frozen keyframes vote only with ``keep_surface``.
+        (inference.surface_votes). Log-odds are the calibrated ones (:meth:`calibrated`) as far as the states
+        allow, if the map is settled and has a surface; otherwise the marginals', with those of winners raised
+        to just above even odds. Frozen keyframes vote only with ``keep_surface``.
         """
         return self.decide()
 
@@ -457,6 +454,11 @@ class MRFMap(BrickMap):
         """Compute :attr:`decided`. ``between`` is called after each keyframe; an exception from it ends the
         work. Raises CapacityError if there is not enough memory."""
         return reading.decide(self, self._parts, between)
+
+    @property
+    def marginals(self) -> "reading.MapReading":
+        """The map by the marginals of belief propagation alone, for queries and exports."""
+        return reading.MapReading(self, self._parts, self._pool.belief)
 
     def calibrated(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
         """The map of calibrated probabilities that voxels hold a surface, from the distances of all rays
@@ -476,7 +478,7 @@ class MRFMap(BrickMap):
         """Difference between the map as of a time in seconds and now: ``appeared`` are voxels that were free
         and are occupied, ``vanished`` the reverse; ``points``, ``before`` and ``after`` list all voxels whose
         state has changed, newly seen ones included. Raises ConfigError in a map of a static world."""
-        return change.compare_maps(self.at(since_s), self)
+        return change.compare_maps(self.at(since_s), self.marginals)
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
