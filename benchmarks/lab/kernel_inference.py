@@ -61,6 +61,10 @@ class KernelMap:
         sampled = [samples_of(view, model) for view in views]
         self._samples = [self._tree_of(np.concatenate(of_all)) for of_all in zip(*sampled, strict=True)]
 
+    @property
+    def marginals(self) -> "KernelMap":
+        return self
+
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability that the cells of points (N, 3) are occupied, (N,)."""
         occupied, free = self._counts(points)
