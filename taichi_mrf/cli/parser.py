@@ -24,8 +24,9 @@ from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.shared.terminal import PROGRAM
 from taichi_mrf.config import schema as config
 from taichi_mrf.config import sections
+from taichi_mrf.config.gone import note_gone
 from taichi_mrf.config.text import field_help
-from taichi_mrf.config.values import has_flag, is_in_files, nearest, note_gone
+from taichi_mrf.config.values import LENGTHS, has_flag, is_in_files, metres, nearest
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph import config as factor_graph_config
 
@@ -66,7 +67,7 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     if command.brief and {*_HELP} & set(rest):
         print(brief_help(program, command.options, command.brief))
         raise SystemExit(0)
-    rest = ["--help" if word == _HELP_ALL else word for word in rest]
+    rest = ["--help" if word == _HELP_ALL else word for word in _in_metres(rest)]
     wants_help = bool({*_HELP} & set(rest))
     if not wants_help:
         _refuse_unknown_flags(program, command, rest)
@@ -82,6 +83,18 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
         example = f", such as {command.example}" if command.example and problem.startswith("missing") else ""
         raise ConfigError(f"{name}: {problem}{example}; '{program} --help' explains") from None
     return command, options
+
+
+def _in_metres(arguments: Sequence[str]) -> Iterator[str]:
+    """The arguments, with lengths that have a unit as numbers of metres."""
+    flag = ""
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        flag = name.strip("-").replace("-", "_") if word.startswith("--") else flag
+        if flag not in LENGTHS or (word.startswith("--") and not equals):
+            yield word
+        else:
+            yield f"{name}={metres(value)}" if equals else metres(word)
 
 
 def in_one_line(box: str) -> str:
