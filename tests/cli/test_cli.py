@@ -255,6 +255,23 @@ def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
+def test_a_run_without_a_voxel_size_takes_what_fits_and_is_the_same_run_again(
+    recording: Path, tmp_path: Path
+) -> None:
+    for path in sorted(recording.glob("*.depth.png")):
+        cv2.imwrite(str(path), np.full((480, 640), 8500, np.uint16))
+    assert_refused(
+        taichi_mrf("map", recording, "--out", tmp_path / "no", "--voxel-size", "5"), "was 5cm meant?"
+    )
+    words = ("--out", tmp_path / "out", "--no-pictures", "--runtime.arch", "cpu", "--image-scale", "0.25")
+    said = mapped(recording, *words)
+    assert "voxel_size is 0.1 m" in said
+    assert load(tmp_path / "out" / "config.yaml").voxel_size == 0.1
+    assert "holds this run already" in mapped(recording, *words)
+    finer = taichi_mrf("map", recording, *words, "--voxel-size", "5cm")
+    assert_refused(finer, "another voxel_size", "--overwrite")
+
+
 def test_an_unfinished_run_is_resumed_or_replaced(tmp_path: Path) -> None:
     mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     report = report_of(tmp_path) | {"interrupted": True}

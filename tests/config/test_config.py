@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
 from taichi_mrf.cli.main import main
+from taichi_mrf.cli.parser import parse
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
@@ -273,6 +274,39 @@ def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
     config = load(written(tmp_path, "voxel_size: 1\ninference: {outlier_floor: 1e-6}"))
     assert config.voxel_size == 1.0
     assert config.inference.outlier_floor == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("length", "size_m"), [("5cm", 0.05), ("50 mm", 0.05), ("0.2m", 0.2), ("1e1cm", 0.1), ("0.05", 0.05)]
+)
+def test_a_voxel_size_may_have_its_unit(tmp_path: Path, length: str, size_m: float) -> None:
+    assert load(written(tmp_path, f"voxel_size: {length}")).voxel_size == size_m
+    for words in (
+        ["--voxel-size", length],
+        [f"--voxel_size={length}"],
+        ["--voxel-size=1cm", "--voxel-size", length],
+    ):
+        _, options = parse(["map", "x", "--out", "y", *words])
+        assert options.settings.voxel_size == size_m
+    assert parse(["bench", "--voxel-sizes", length, "2cm", "--frames", "3"])[1].voxel_sizes == (size_m, 0.02)
+
+
+@pytest.mark.parametrize("length", ["5c", "cm", "5 ccm", "5mcm", "5km", "five cm"])
+def test_what_is_no_length_is_an_error(tmp_path: Path, length: str) -> None:
+    with pytest.raises(ConfigError, match="voxel_size must be a number"):
+        load(written(tmp_path, f"voxel_size: {length}"))
+    with pytest.raises(ConfigError, match="parsing --voxel-size"):
+        parse(["map", "x", "--out", "y", "--voxel-size", length])
+
+
+@pytest.mark.parametrize("command", ["map", "live", "tune"])
+def test_a_voxel_size_that_nothing_gives_is_to_fit(tmp_path: Path, command: str) -> None:
+    words = [command, "x", "--out", str(tmp_path / "run")]
+    other, sized = tmp_path / "other.yaml", written(tmp_path, "voxel_size: 0.05")
+    other.write_text("inference: {sweeps: 2}", encoding="utf-8")
+    for more, fits in ([], True), (["--config", str(other)], True), (["--config", str(sized)], False):
+        assert parse([*words, *more])[1].settings.fit_voxel_size == fits
+        assert not parse([*words, *more, "--voxel-size", "0.05"])[1].settings.fit_voxel_size
 
 
 def test_tables_are_found_from_the_files_folder(tmp_path: Path) -> None:
