@@ -215,6 +215,8 @@ def _not_recognised(path: Path) -> str:
         inside = [child.name for child in _recordings(children)]
         if inside:
             return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
+    elif (around := recognise(path.parent)) is not None:
+        return f"{path}: is one file of a recording ({around.name}): pass its folder, {path.parent}"
     hint = resolve_name("taichi_mrf.datasets.hints:hint_for")(path)
     if hint is not None:
         return f"{path}: {hint}"
