@@ -125,6 +125,8 @@ def test_a_number_for_what_was_not_seen_is_no_measurement_or_is_said(
 def test_no_range_is_sought_without_bound() -> None:
     endless_m = Street("street", CAMERA, far_m=1e10)
     assert with_recorded_noise(Config(), endless_m).sensor.max_depth < 10_000
+
+
 @pytest.mark.parametrize(
     ("median_m", "sigma_m", "size_m"),
     [
