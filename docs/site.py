@@ -60,6 +60,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         markdown = re.sub(r"^!\[.*$", rf"\g<0>\n\n{TURN}", markdown, count=1, flags=re.MULTILINE)
     for name, source in BROUGHT_IN.items():
         markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({name}\1)", markdown)
+    markdown = re.sub(r"\]\((?:\.\./)?configs/default\.yaml\)", "](parameters.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/([^)]+)\)", r"](\1)", markdown)
     elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf|tests|Makefile)/?)[^)]*"

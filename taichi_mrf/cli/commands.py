@@ -33,7 +33,7 @@ class Command:
     function: str
     parameters: Callable[[Sequence[str]], Any] | None = None
     brief: tuple[str, ...] = ()
-    """The flags that --help explains; --help-all explains all. If it is empty, --help does so too."""
+    """The flags that --help explains; --help-all explains all. If it is empty, --help does so, too."""
     example: str = ""
     """A command that works everywhere, for the line that says what is wrong with another."""
 

@@ -20,6 +20,7 @@ from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Arch, Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.recorded_noise import proposed_voxel_size
 from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
 from taichi_mrf.datasets.ros.bag import BagSummary
 from taichi_mrf.datasets.ros.bag import summarise as summarise_bag
@@ -95,6 +96,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
     found = summarise(dataset)
     content = {field.name: getattr(found, field.name) for field in fields(found)}
     content["camera"] = _camera_facts(found.camera)
+    content["voxel_size"] = proposed_voxel_size(dataset)
     return facts | {"format": format_name(options.source)} | content | {"notes": notes}
 
 
@@ -192,6 +194,8 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
         table.add_row(
             "depth", f"{low:.2f} to {high:.2f} m (1 to 99 %), in {found.measured:.0%} of the pixels"
         )
+        size_cm = 100 * proposed_voxel_size(dataset)
+        table.add_row("voxel size", f"{size_cm:g} cm fits; map takes it unless --voxel-size is given")
     if found.centre_range is not None:
         axes = (f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", *found.centre_range, strict=True))
         table.add_row("way", f"{', '.join(axes)} m")

@@ -24,8 +24,9 @@ from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.shared.terminal import PROGRAM
 from taichi_mrf.config import schema as config
 from taichi_mrf.config import sections
+from taichi_mrf.config.gone import note_gone
 from taichi_mrf.config.text import field_help
-from taichi_mrf.config.values import has_flag, is_in_files, nearest, note_gone
+from taichi_mrf.config.values import LENGTHS, has_flag, is_in_files, metres, nearest
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph import config as factor_graph_config
 
@@ -63,25 +64,33 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     if name not in COMMANDS:
         raise ConfigError(f"unknown command '{name}'; {nearest(name, list(COMMANDS))}")
     command, program = COMMANDS[name], f"{PROGRAM} {name}"
-    if command.brief and {*_HELP} & set(rest):
-        print(brief_help(program, command.options, command.brief))
+    if {*_HELP, _HELP_ALL} & set(rest):
+        print(help_text(program, command.options, () if _HELP_ALL in rest else command.brief))
         raise SystemExit(0)
-    rest = ["--help" if word == _HELP_ALL else word for word in rest]
-    wants_help = bool({*_HELP} & set(rest))
-    if not wants_help:
-        _refuse_unknown_flags(program, command, rest)
+    rest = list(_in_metres(rest))
+    _refuse_unknown_flags(program, command, rest)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            default = command.defaults([] if wants_help else rest)
+            default = command.defaults(rest)
             options = tyro.cli(command.options, prog=program, args=rest, default=default, registry=registry)
-    except SystemExit as end:
-        if not end.code:
-            raise
+    except SystemExit:
         problem = in_one_line(box.getvalue())
         example = f", such as {command.example}" if command.example and problem.startswith("missing") else ""
         raise ConfigError(f"{name}: {problem}{example}; '{program} --help' explains") from None
     return command, options
+
+
+def _in_metres(arguments: Sequence[str]) -> Iterator[str]:
+    """The arguments, with lengths that have a unit as numbers of metres."""
+    flag = ""
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        flag = name.strip("-").replace("-", "_") if word.startswith("--") else flag
+        if flag not in LENGTHS or (word.startswith("--") and not equals):
+            yield word
+        else:
+            yield f"{name}={metres(value)}" if equals else metres(word)
 
 
 def in_one_line(box: str) -> str:
@@ -215,25 +224,30 @@ def flags_of(options: type, prefix: str = "", pairs_off: bool = False) -> Iterat
         yield Flag(f"--{word}", metavar, texts.get(field.name, ""), field.default, off)
 
 
-def brief_help(program: str, options: type, brief: Sequence[str]) -> str:
-    """The usage, what the command does, its arguments and the flags of the given names."""
+def help_text(program: str, options: type, brief: Sequence[str] = ()) -> str:
+    """The usage, what the command does, its arguments and flags, or those of them that ``brief`` names."""
     flags = list(flags_of(options))
     by_name = {flag.name: flag for flag in flags}
-    shown = [flag for flag in flags if flag.positional] + [by_name[f"--{name}"] for name in brief]
-    required = [flag.shown() for flag in shown if flag.default is dataclasses.MISSING]
+    shown = [flag for flag in flags if flag.positional]
+    shown += [by_name[f"--{name}"] for name in brief] if brief else [f for f in flags if not f.positional]
+    needed = [flag for flag in shown if flag.positional or flag.default is dataclasses.MISSING]
+    usage = [f.shown() if f.default is dataclasses.MISSING else f"[{f.shown()}]" for f in needed]
     width = min(_WIDEST, shutil.get_terminal_size().columns)
-    lines = [f"usage: {program} {' '.join(required)} [FLAGS]", ""]
+    lines = [" ".join(["usage:", program, *usage, "[FLAGS]"]), ""]
     for paragraph in (textwrap.dedent(f"    {options.__doc__}")).split("\n\n"):
         lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""]
     for flag in shown:
         lines += _flag_entry(flag, width)
-    lines += ["", f"'{program} --help-all' explains all {sum(not flag.positional for flag in flags)} flags."]
+    if brief:
+        count = sum(not flag.positional for flag in flags)
+        lines += ["", f"'{program} --help-all' explains all {count} flags."]
     return "\n".join(lines)
 
 
 def _flag_entry(flag: Flag, width: int) -> list[str]:
     """One flag with its help beside it, or below it if the flag is long."""
-    text = textwrap.wrap(flag.help + _default_words(flag), width - _INDENT)
+    plain = flag.help.replace("``", "").replace("`", "")  # a terminal has no type for code
+    text = textwrap.wrap(plain + _default_words(flag), width - _INDENT)
     first = f"  {flag.shown()}"
     if len(first) + 2 > _INDENT:
         return [first, *(" " * _INDENT + line for line in text)]
@@ -241,9 +255,12 @@ def _flag_entry(flag: Flag, width: int) -> list[str]:
 
 
 def _default_words(flag: Flag) -> str:
-    if flag.default in (None, False, dataclasses.MISSING, ""):
-        return " (required)" if flag.default is dataclasses.MISSING else ""
-    return f" (default: {flag.default})"
+    default = flag.default
+    if default in (None, False, dataclasses.MISSING, "", ()):
+        return " (required)" if default is dataclasses.MISSING else ""
+    if default is True:  # a flag that switches off says by its name what is on
+        return " (default: on)" if flag.negative else ""
+    return f" (default: {' '.join(map(str, default)) if isinstance(default, tuple) else default})"
 
 
 def _metavar(hint: Any) -> str:

@@ -19,13 +19,21 @@ _MOST_BYTES = 1_000_000
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases."""
+    """PyYAML's safe loader without aliases and without keys that stand twice, of which it takes the last."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark
             raise yaml.composer.ComposerError(None, None, "aliases (*name) are not supported", mark)
         return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        first: dict[str, yaml.Node] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and first.setdefault(key.value, key) is not key:
+                problem = f"'{key.value[:100]}' stands twice"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def parse_yaml(text: str) -> Any:

@@ -26,8 +26,8 @@ from taichi_mrf.config.sections import (
 from taichi_mrf.config.values import (
     IN_FILES,
     IN_PYTHON,
-    as_files_set_it,
     check_field,
+    check_files_set_it,
     from_dict,
     in_files,
     in_python,
@@ -244,7 +244,8 @@ class Config:
     """All parameters of mapping a sequence: those that every method shares, and a section for each method."""
 
     voxel_size: float = 0.05
-    """Side of a voxel in metres."""
+    """Side of a voxel in metres, or with its unit: 5cm. Without it commands take 5 cm, or what fits the
+    recording's depths and noise."""
 
     method: MethodName = field(
         default=next(iter(METHODS)),
@@ -294,6 +295,10 @@ class Config:
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """The device that runs the kernels."""
 
+    fit_voxel_size: bool = in_python(False)
+    """Take another voxel size where 5 cm fits neither the recording's depths nor its noise. Commands set it
+    where no size is given."""
+
     def __post_init__(self) -> None:
         ok = 0 < real(self.voxel_size, "voxel_size") < math.inf
         check_field(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
@@ -319,7 +324,8 @@ def load(path: str | Path) -> Config:
     to its folder. Raises ConfigError, which names the file and the parameter."""
     path = find_config(path)
     config = from_dict(Config, read_yaml(path), str(path))
-    return with_absolute_tables(as_files_set_it(config, str(path)), path.parent)
+    check_files_set_it(config, str(path))
+    return with_absolute_tables(config, path.parent)
 
 
 def with_absolute_tables(config: Config, folder: Path) -> Config:

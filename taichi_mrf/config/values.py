@@ -1,5 +1,5 @@
-"""Values of parameters: the places where each can be set, those of earlier versions, and typed dataclasses
-made from the plain values of YAML or of a caller.
+"""Values of parameters: the places where each can be set, and typed dataclasses made from the plain values of
+YAML or of a caller.
 
 A dataclass is the only definition of its parameters' names and types. A value that does not fit raises a
 ConfigError, which names the place and, for an unknown name, the nearest known one.
@@ -43,53 +43,20 @@ def is_in_files(field: "dataclasses.Field[Any]") -> bool:
     return bool(field.metadata.get("file", True))
 
 
-_ALWAYS = "it is {} for all maps, the best value in tests"
+LENGTHS = ("voxel_size", "voxel_sizes", "submap_size", "cell_size")
+"""The parameters, flags among them, that may be stated with a unit: 5cm."""
 
-GONE: dict[str, dict[str, tuple[Any, str]]] = {
-    "InferenceConfig": {
-        "method": ("sum-product", "MRFMap computes marginals; factor_graph() and laser have max-product"),
-        "tolerance": (0.0, "MRFMap.infer takes it as an argument"),
-        "damping": (0.0, "messages are not damped"),
-        "likelihood": ("auto", "the likelihood is averaged over a segment where sigma is less than a voxel"),
-        "tail_share": (0.0, "errors are normal; outlier_floor allows for others"),
-        "tail_sigmas": (10.0, "errors are normal; outlier_floor allows for others"),
-        "end_sigmas": (3.0, "a ray ends 3 sigma behind its measurement"),
-        "segment_lengths": (True, "a voxel counts by the length of the ray in it"),
-        "plane_window": (0.0, "predicted depth and the surface are finer than voxels without it"),
-        "ray_choice": ("bundle", "pixels that agree share a ray"),
-        "first_sweep_stride": (1, "every ray is followed; ray_density sets how many there are"),
-        "free_space_stride": (1, "every ray is followed; ray_density sets how many there are"),
-        "average": ("log_odds", "log-odds are averaged"),
-        "ray_correlation": (1.0, "a keyframe counts once, as in the paper"),
-        "min_length": (0.02, _ALWAYS.format("0.02")),
-        "message_clamp": (6.9, _ALWAYS.format("6.9")),
-        "cavity_clamp": (9.2, _ALWAYS.format("9.2")),
-        "doubt_free": (0.01, _ALWAYS.format("0.01")),
-        "doubt_occupied": (0.01, _ALWAYS.format("0.01")),
-        "return_pass": ("replay", "rays are replayed from a trace"),
-        "message_precision": ("float16", _ALWAYS.format("float16")),
-    },
-    "KeyframeConfig": {"against": ("last", "a frame is compared with the last keyframe, as in the paper")},
-    "PoseConfig": {
-        "rounds": (2, "keyframes are aligned with each other in at most 2 rounds"),
-        "use_color": (True, "a camera is tracked by its colour images too, where it has any"),
-        "carry_unnamed": (True, "frames without a pose move with the last one before them that has one"),
-        "follow_budget_s": (0.2, "keyframes follow a file for about 0.2 s between two frames"),
-        "follow_quiet_s": (10.0, "poses that follow a file are final after 10 s without a change"),
-    },
-    "RuntimeConfig": {"debug": (False, "taichi_mrf.init takes it as an argument")},
-}
-"""By the name of the dataclass that had it: a parameter's default, which needs no warning, and what became of
-it."""
+_UNITS_M = {"mm": 1000, "cm": 100, "m": 1}
 
 
-def note_gone(section: str, key: str, value: object) -> str | None:
-    """Note on a removed parameter: "" if its value was the default; None if none ever had this name."""
-    known = GONE.get(section, {}).get(key)
-    if known is None:
-        return None
-    default, became = known
-    return "" if value == default else f"{key} is no longer a parameter: {became}"
+def metres(text: str) -> str:
+    """A length with a unit, such as 5cm or 50 mm, as a number of metres; any other text as it stands."""
+    number = text.rstrip().rstrip("cm")
+    per_m = _UNITS_M.get(text.rstrip()[len(number) :])
+    try:
+        return text if per_m is None else repr(float(number) / per_m)
+    except ValueError:
+        return text
 
 
 _LARGEST = 2**63 - 1
@@ -113,6 +80,8 @@ def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
     names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
     for key, value in overrides.items():
         if key not in names:
+            from taichi_mrf.config.gone import note_gone  # loaded for those who need it
+
             note = note_gone(type(config).__name__, key, value)
             raise ConfigError(f"{where}: {note}") if note else unknown_key(key, names, where)
     hints = typing.get_type_hints(type(config))
@@ -133,11 +102,13 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 100
 
 
-def from_dict(cls: type[T], values: Any, where: str) -> T:
+def from_dict(cls: type[T], values: Any, where: str, of_map: bool = False) -> T:
     """Build a configuration dataclass from parsed YAML.
 
-    ``where`` is the file, for error messages. Warns of a removed parameter. Raises ConfigError for an unknown
-    key (naming the nearest), a value of the wrong type, or one outside its range.
+    ``where`` is the file, for error messages. Raises ConfigError for an unknown key (naming the nearest), a
+    removed parameter that is not at its former default (saying what became of it), a value of the wrong type,
+    or one outside its range. The parameters ``of_map`` are those with which a map was made, by whatever
+    version: removed ones are left out with a warning.
     """
     if values is None:
         values = {}
@@ -147,13 +118,18 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
     arguments = {}
     for key, value in values.items():
         if key not in hints:
+            from taichi_mrf.config.gone import note_gone
+
             note = note_gone(cls.__name__, str(key), value)
             if note is None:
                 raise unknown_key(key, hints, where)
+            if note and not of_map:
+                raise ConfigError(f"{where}: {note}; remove it")
             if note:
                 warnings.warn(f"{where}: {note}", stacklevel=2)
             continue
-        arguments[key] = _convert(value, hints[key], f"{where}: {key}")
+        plain = metres(value) if key in LENGTHS and isinstance(value, str) else value
+        arguments[key] = _convert(plain, hints[key], f"{where}: {key}", of_map)
     missing = [
         field.name
         for field in dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -167,27 +143,24 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
         raise ConfigError(f"{where}: {error}") from error
 
 
-def as_files_set_it(config: Any, where: str, in_files: bool = True) -> Any:
-    """A dataclass read from a file without what only Python sets (values.py). Warns of each value that
-    differs from its default, because files of earlier versions set it."""
-    kept = {}
+def check_files_set_it(config: Any, where: str, in_files: bool = True) -> None:
+    """Raise ConfigError for a value of a dataclass read from a file that only Python sets. Its default is let
+    pass, because files of earlier versions hold it."""
     for field in dataclasses.fields(config):
         value, allowed = getattr(config, field.name), in_files and is_in_files(field)
         if dataclasses.is_dataclass(value):
-            kept[field.name] = as_files_set_it(value, where, allowed)
+            check_files_set_it(value, f"{where}: {field.name}", allowed)
         elif not allowed and value != field.default:
-            instead = f"set it in Python, {type(config).__name__}({field.name}={value!r})"
-            warnings.warn(f"{where}: {field.name} is not read from files; {instead}", stacklevel=2)
-            kept[field.name] = field.default
-    return dataclasses.replace(config, **kept)
+            instead = f"set it in Python, {type(config).__name__}({field.name}={value!r}), or remove it"
+            raise ConfigError(f"{where}: {field.name} is not read from files; {instead}")
 
 
-def _convert(value: Any, hint: Any, where: str) -> Any:
+def _convert(value: Any, hint: Any, where: str, of_map: bool = False) -> Any:
     """Convert one value to a field's type. Whole numbers are accepted for float, numbers of NumPy for
-    both."""
+    both. ``of_map`` as in :func:`from_dict`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
-        return from_dict(typing.cast(type, hint), value, where)
+        return from_dict(typing.cast(type, hint), value, where, of_map)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None

@@ -1,5 +1,6 @@
 """A recording's own facts of its sensor, put into the parameters: the noise of depth that a stereo
-calibration gives, how far depths reach, and that a lidar's beams pass what fills only a part of a voxel."""
+calibration gives, how far depths reach, which voxels fit them, and that a lidar's beams pass what fills only
+a part of a voxel."""
 
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ from taichi_mrf.config.files import shipped_configs
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.errors import BackendError, FrameError
+from taichi_mrf.errors import BackendError, ConfigError, FrameError
 from taichi_mrf.sensor.noise import evaluate, patch_coefficients
 
 RIG = "stereo"
@@ -37,18 +38,29 @@ FARTHEST_M = 10_000.0
 FILLED, FARTHEST_OTHER = 0.03, 0.9
 """A number that so many measurements are, and all others are at most so much of it, may be no measurement."""
 
+FINEST, COARSEST = 0.01, 0.1
+"""Shares of the median depth between which a voxel's size fits."""
+
+ABSURD = 0.5
+"""Share of the median depth above which a voxel's size is a slip."""
+
+_UNITS = (("cm", 100), ("mm", 1000))
+
 LOOKED_AT = 3
 """Frames whose depths are looked at: the first, the middle and the last one."""
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own origin, sigma, reach, ``pass_through`` and density of outliers
-    in place of the defaults; adds notes to the dataset.
+    """The parameters with the recording's own origin, sigma, reach, ``pass_through``, density of outliers and
+    voxel size in place of the defaults; adds notes to the dataset.
 
-    What the user has set stays, and a sigma or sigma table that is set is that of all pixels.
+    What the user has set stays, and a sigma or sigma table that is set is that of all pixels. Raises
+    ConfigError if a voxel is larger than half the median depth.
     """
-    settings = _with_reach(_with_sigma(_with_origin(settings, dataset), dataset), dataset)
-    return _with_floor(_with_pass_through(settings, dataset), dataset)
+    depths_m = some_depths(dataset)
+    settings = _with_reach(_with_sigma(_with_origin(settings, dataset), dataset), dataset, depths_m)
+    settings = _with_floor(_with_pass_through(settings, dataset), dataset, depths_m)
+    return _with_voxel_size(settings, dataset, depths_m)
 
 
 def _with_origin(settings: Config, dataset: Dataset) -> Config:
@@ -89,12 +101,11 @@ def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
     return replace(settings, sensor=replace(settings.sensor, pixel_sigma=False))
 
 
-def _with_reach(settings: Config, dataset: Dataset) -> Config:
+def _with_reach(settings: Config, dataset: Dataset, depths_m: NDArray[np.float32]) -> Config:
     sensor, own = settings.sensor, dataset.stated.reach_m
     given = sensor.max_depth != SensorConfig().max_depth
     if own is not None and not given:
         return _reaching(settings, dataset, own, "as far as the first scan reaches")
-    depths_m = some_depths(dataset)
     dataset.notes += _note_of_filling(depths_m)
     beyond = float((depths_m > sensor.max_depth).mean()) if depths_m.size else 0.0
     useful = _useful_depth(sensor, depths_m)
@@ -155,13 +166,53 @@ def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
     return float(np.rint(tried[max(0, worse[0] - 1)] if len(worse) else tried[-1]))
 
 
-def _with_floor(settings: Config, dataset: Dataset) -> Config:
+def proposed_voxel_size(dataset: Dataset) -> float:
+    """The voxel size in metres that fits a recording's depths and the noise that it states."""
+    return _fitting_voxel_m(dataset, _median_m(some_depths(dataset)))
+
+
+def _median_m(depths_m: NDArray[np.float32]) -> float:
+    return float(np.median(depths_m)) if depths_m.size else 0.0
+
+
+def _fitting_voxel_m(dataset: Dataset, median_m: float) -> float:
+    """5 cm, or the next of 1, 2, 5, 10, 20, ... cm with which a voxel at the median depth is neither finer
+    than sigma or a hundredth of the depth, nor coarser than a tenth of it."""
+    usual = Config().voxel_size
+    if median_m == 0:  # nothing is known
+        return usual
+    sigma_m = 0.0 if dataset.stated.sigma is None else float(np.polyval(dataset.stated.sigma[::-1], median_m))
+    finest, coarsest = max(FINEST * median_m, sigma_m), COARSEST * median_m
+    sizes = [digit * 10.0**power for power in range(-4, 3) for digit in (1, 2, 5)]
+    if coarsest < usual:
+        return max((size for size in sizes if size <= coarsest), default=sizes[0])
+    return max(usual, next((size for size in sizes if size >= min(finest, coarsest)), sizes[-1]))
+
+
+def _with_voxel_size(settings: Config, dataset: Dataset, depths_m: NDArray[np.float32]) -> Config:
+    median_m, size = _median_m(depths_m), settings.voxel_size
+    fitting = _fitting_voxel_m(dataset, median_m)
+    if settings.fit_voxel_size:
+        if fitting != size:
+            why = f"half of the measured depths are more than {median_m:.2g} m"
+            dataset.notes.append(f"voxel_size is {fitting:g} m, since {why}; --voxel-size overrides it")
+        return replace(settings, voxel_size=fitting, fit_voxel_size=False)
+    if median_m and size > ABSURD * median_m:
+        meant = next((f"{size:g}{unit}" for unit, per_m in _UNITS if size / per_m <= COARSEST * median_m), "")
+        asked = f": was {meant} meant?" if meant else ";"
+        raise ConfigError(
+            f"voxel_size is {size:g} m, more than half the median depth of {dataset.name}, {median_m:.2g} m"
+            f"{asked} --voxel-size {100 * fitting:g}cm fits"
+        )
+    return settings
+
+
+def _with_floor(settings: Config, dataset: Dataset, depths_m: NDArray[np.float32]) -> Config:
     given, reach_m = settings.inference, settings.sensor.max_depth
     if given.outlier_floor is not None:
         return settings
     short = dataset.stated.pass_through is None and reach_m <= SensorConfig().max_depth
-    depths_m = some_depths(dataset) if short else np.zeros(0, np.float32)
-    if depths_m.size:
+    if short and depths_m.size:
         short = float(np.minimum(depths_m, reach_m).mean()) * given.surface_density <= LONG_RAY
     return _with_outliers(settings, SHORT_RAYS_FLOOR) if short else settings
 

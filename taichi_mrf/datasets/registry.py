@@ -21,6 +21,7 @@ from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import mended, pose_of, resampled
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
+from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.ros.names import is_bag
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
@@ -216,6 +217,9 @@ def _not_recognised(path: Path) -> str:
         if inside:
             return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
     hint = resolve_name("taichi_mrf.datasets.hints:hint_for")(path)
+    around = None if is_folder(path) else recognise(path.parent)
+    if around is not None and (hint is None or path.suffix.lower() in DEPTH_SUFFIXES):
+        return f"{path}: is one file of a recording ({around.name}): pass its folder, {path.parent}"
     if hint is not None:
         return f"{path}: {hint}"
     looked_for = "; ".join([*(f"{each.name}: {each.looks_for}" for each in _formats()), *plugs()[1]])

@@ -29,8 +29,9 @@ class ExportOptions:
     measured surface. A .zarr gets it with rays, and with auto after --keep-surface."""
 
     cells: bool = True
-    """Show a cell of 2, 4 or 8 voxels if it reaches the threshold and none of its voxels does: in .ply as a
-    point with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
+    """Cells of 2, 4 or 8 voxels that reach the threshold though none of their voxels does are written, too,
+    but with --no-cells: in .ply as a point with the property size, in cubes and .html as all their voxels, in
+    .bt and .ot as a larger leaf."""
 
     color_by: Literal["auto", "marginal", "photo"] = "auto"
     """Colours in .ply, .glb, .obj, .ot, .html and .zarr: of the marginals (not in .ot and .zarr), or of the

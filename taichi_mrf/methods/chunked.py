@@ -40,7 +40,7 @@ def _config_of(store: ChunkStore) -> Config:
         values = parse_yaml(store.header.config)
         if isinstance(values, dict) and isinstance(values.get("method"), str):
             check_registered(store.path, values["method"])
-        config = from_dict(Config, values, str(store.path))
+        config = from_dict(Config, values, str(store.path), of_map=True)
     except ValueError as error:
         raise MapFileError(
             f"{store.path}: damaged: its configuration cannot be read: {said(error)}"

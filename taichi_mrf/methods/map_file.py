@@ -254,7 +254,7 @@ def _up(path: Path, file: NpzFile, keyframes: list[StoredKeyframe]) -> Up | None
 
 def _config(path: Path, file: NpzFile) -> Config:
     try:
-        return from_dict(Config, parse_yaml(file.scalar("config", "U")), f"{path}: config")
+        return from_dict(Config, parse_yaml(file.scalar("config", "U")), f"{path}: config", of_map=True)
     except ValueError as error:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
 

@@ -54,12 +54,12 @@ def noise_notes(
     """Notes on a run's noise; ``mistakes`` are those that a doctor finds if recording and map disagree."""
     notes = []
     if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
-        notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")
+        notes.append(f"The noise of depth stays as stated: {learnt.frames} held-out frames agree with it.")
     elif learnt is not None:
         notes.append(
-            f"Sigma was learnt from {learnt.frames} held-out frames in {learnt.seconds:.1f} s: "
-            f"{sensor.sigma_scale:g} times the stated one and {100 * sensor.sigma_added:.2g} cm; a single "
-            f"factor would have been {learnt.factor:.2g}. --noise given leaves it as stated."
+            f"The noise of depth was learnt from {learnt.frames} held-out frames in {learnt.seconds:.1f} s, "
+            f"and is in use: {_law_words(sensor.sigma_scale, sensor.sigma_added)}. There is nothing to do; "
+            "--noise given takes it as stated."
         )
     if learnt is not None and learnt.prior:
         changed = ", ".join(f"inference.{name} is {value:g}" for name, value in learnt.prior.items())
@@ -100,7 +100,12 @@ def _noise_name(sensor: SensorConfig) -> str:
 def _better(law: SigmaLaw | None) -> str:
     if law is None:
         return ""
-    return f"; likeliest is {law.scale:.2g} times the stated sigma and {100 * law.added_m:.2g} cm"
+    return f"; likeliest is {_law_words(law.scale, law.added_m)}"
+
+
+def _law_words(scale: float, added_m: float) -> str:
+    added = f" plus {100 * added_m:.2g} cm" if added_m else ""
+    return f"{scale:.2g} times the stated sigma{added}"
 
 
 def _advice(sensor: SensorConfig, learnt: LearntSigma | None, check: NoiseCheck) -> str:

@@ -81,7 +81,7 @@ class Extras:
         try:
             return self._catch_up(go_on)
         except Exception as error:  # mapping continues without the baseline
-            self._run.send(Notice(f"baseline: {error}", "error"))
+            self._run.send(Notice(f"baseline: {error}", "error", gives_up="baseline"))
             self._watch = dataclasses.replace(self._watch, baseline=False)
             return True
 

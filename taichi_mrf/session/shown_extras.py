@@ -274,9 +274,9 @@ class BaselineOverlay:
     """A map by OctoMap's method that follows a mapper's keyframes, one piece of work at a time."""
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
-        """An empty map with a configuration's parameters, but for the window, which its method lacks, and
-        for time: OctoMap's update forgets nothing."""
-        static = replace(without_window(config), time=TimeConfig())
+        """An empty map with a configuration's parameters, but for the window, colours and kept surfaces,
+        which its method lacks, and for time: OctoMap's update forgets nothing."""
+        static = replace(without_window(config), time=TimeConfig(), color=False, keep_surface=False)
         self.map: OccupancyMap = octomap_method().load_class().with_noise(static, noise)
         self._publisher = Publisher(
             "baseline",

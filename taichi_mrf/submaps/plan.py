@@ -175,7 +175,7 @@ class Job:
             submaps = [Submap(tuple(s["cell"]), tuple(s["keyframes"])) for s in plan["submaps"]]
             return Job(
                 SourceFrames(**content["sequence"]),
-                from_dict(Config, parse_yaml(content["config"]), str(path)),
+                from_dict(Config, parse_yaml(content["config"]), str(path), of_map=True),
                 content["submap_size"],
                 Plan(plan["chunks_across"], tuple(submaps)),
                 {int(index): tuple(centre) for index, centre in content["centres_m"].items()},

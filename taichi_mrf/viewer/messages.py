@@ -237,10 +237,11 @@ class Alive(Update):
 
 @dataclass(frozen=True)
 class Notice(Update):
-    """A sentence for the user."""
+    """A sentence for the user. ``gives_up`` is what the mapping process shows no more."""
 
     text: str
     severity: Literal["info", "warning", "error"] = "info"
+    gives_up: Literal["", "baseline"] = ""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+import tyro
 from console import (
     COARSE,
     FAST,
@@ -33,7 +34,7 @@ from new_interpreter import obey_hangups, output
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.main import main
-from taichi_mrf.cli.parser import flags_of, parse
+from taichi_mrf.cli.parser import flags_of, parse, registry
 from taichi_mrf.config.schema import load
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import COMPILERS
@@ -149,14 +150,32 @@ def test_the_short_help_of_map_has_colour_and_noise() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_list_of_flags_is_that_of_the_parser(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = COMMANDS[name]
     with pytest.raises(SystemExit):
-        parse([name, "--help-all"])
+        tyro.cli(command.options, args=["--help"], default=command.defaults([]), registry=registry)
     lines = _option_lines(capsys.readouterr().out)
-    printed = {word.rstrip(".") for word in re.findall(r"(?<!\S)--[a-z][a-z0-9._-]*", lines)}
-    flags = list(flags_of(COMMANDS[name].options))
+    known = {word.rstrip(".") for word in re.findall(r"(?<!\S)--[a-z][a-z0-9._-]*", lines)}
+    flags = list(flags_of(command.options))
     listed = {each for flag in flags for each in (flag.name, flag.negative) if each and each.startswith("--")}
-    assert listed == printed - {"--help"}
-    assert {f"--{each}" for each in COMMANDS[name].brief} <= listed
+    assert listed == known - {"--help"}
+    assert {f"--{each}" for each in command.brief} <= listed
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_of_one_style_and_without_marks_of_code(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as end:
+            parse([name, word])
+        assert end.value.code == 0
+        text = capsys.readouterr().out
+        assert text.startswith(f"usage: taichi-mrf {name} ")
+        assert not re.search(r"`|│|--no-no-|usage:.*  ", text)
+    for flag in flags_of(COMMANDS[name].options):
+        assert not flag.help or flag.name in text
+        if flag.default is True and flag.negative is None:  # what is on, and which flag ends it
+            assert flag.name in flag.help
 
 
 def _option_lines(text: str) -> str:
@@ -255,6 +274,23 @@ def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
+def test_a_run_without_a_voxel_size_takes_what_fits_and_is_the_same_run_again(
+    recording: Path, tmp_path: Path
+) -> None:
+    for path in sorted(recording.glob("*.depth.png")):
+        cv2.imwrite(str(path), np.full((480, 640), 8500, np.uint16))
+    assert_refused(
+        taichi_mrf("map", recording, "--out", tmp_path / "no", "--voxel-size", "5"), "was 5cm meant?"
+    )
+    words = ("--out", tmp_path / "out", "--no-pictures", "--runtime.arch", "cpu", "--image-scale", "0.25")
+    said = mapped(recording, *words)
+    assert "voxel_size is 0.1 m" in said
+    assert load(tmp_path / "out" / "config.yaml").voxel_size == 0.1
+    assert "holds this run already" in mapped(recording, *words)
+    finer = taichi_mrf("map", recording, *words, "--voxel-size", "5cm")
+    assert_refused(finer, "another voxel_size", "--overwrite")
+
+
 def test_an_unfinished_run_is_resumed_or_replaced(tmp_path: Path) -> None:
     mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     report = report_of(tmp_path) | {"interrupted": True}
@@ -288,6 +324,11 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 ) -> None:
     assert_refused(taichi_mrf("map", *arguments, "--out", tmp_path / "a" / "b"), *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_file_of_a_recording_names_its_folder(recording: Path, tmp_path: Path) -> None:
+    done = taichi_mrf("map", recording / "frame-000000.depth.png", "--out", tmp_path / "out")
+    assert_refused(done, f"is one file of a recording (7-Scenes): pass its folder, {recording}")
 
 
 def test_an_unknown_key_names_the_nearest(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_live_learns_what_map_learns(tmp_path: Path, learnt: Path, monkeypatch: 
     flags = (*FINE, "--evaluation.hold-out", "4", "--time.half-life-s", "0", *TOO_SMALL, "--noise", "auto")
     done = taichi_mrf("live", ROOM, "--out", tmp_path / "live", "--exit-when-done", "--port", "0", *flags)
     assert done.returncode == 0, done.stderr
-    assert "Sigma was learnt from" in done.stdout
+    assert "The noise of depth was learnt from" in done.stdout
     noise = noise_in(tmp_path / "live" / "sensor.yaml")
     assert noise == noise_in(learnt / "sensor.yaml")
     assert (noise["sigma_scale"], noise["sigma_added"]) != (1.0, 0.0)
@@ -107,7 +107,7 @@ def test_tune_begins_with_what_it_learns(tmp_path: Path) -> None:
         "--noise", "auto", *FINE, *TOO_SMALL,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "Sigma was learnt from" in done.stdout
+    assert "The noise of depth was learnt from" in done.stdout
     learnt = noise_in(tmp_path / "sensor.yaml")
     assert learnt["sigma_scale"] > 1.0 or learnt["sigma_added"] > 0.0
     first = load(tmp_path / "best.yaml").sensor
@@ -141,7 +141,7 @@ def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
         done = taichi_mrf("map", ROOM, "--out", out, "--limit", "3", *FAST, *flags)
         assert done.returncode == 0, done.stderr
     assert load(learns / "config.yaml").sensor.sigma_scale == 1.5
-    notes = [note for note in report_of(learns)["notes"] if note.startswith("Sigma was learnt")]
+    notes = [note for note in report_of(learns)["notes"] if note.startswith("The noise of depth was learnt")]
     assert len(notes) == 1
     assert "in 2.5 s" in notes[0]
     assert load(tmp_path / "given" / "config.yaml").sensor.sigma_scale == 1.0

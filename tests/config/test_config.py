@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
+from taichi_mrf.cli.main import main
+from taichi_mrf.cli.parser import parse
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
@@ -87,10 +89,36 @@ def written(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_a_parameter_of_an_earlier_version_is_read_with_a_warning(tmp_path: Path) -> None:
-    path = written(tmp_path, "inference: {damping: 0.3, sweeps: 2}\n")
-    with pytest.warns(UserWarning, match=r"yaml: inference: damping is no longer a parameter: messages"):
-        assert load(path) == dataclasses.replace(Config(), inference=InferenceConfig(sweeps=2))
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("inference: {damping: 0.3}", "inference: damping is no longer a parameter: messages are not damped"),
+        ("poses: {rounds: 5}", "poses: rounds is no longer a parameter: keyframes are aligned"),
+        ("keyframes: {against: all}", "keyframes: against is no longer a parameter: a frame is compared"),
+        ("visibility: {visible_if_occluded: .2}", "visibility: visible_if_occluded is not read from files; "
+         "set it in Python, VisibilityConfig(visible_if_occluded=0.2)"),
+        ("wavemap: {range_sigma: 0.1}", "wavemap: range_sigma is not read from files; set it in Python"),
+        ("log_odds: {max_range: 5}", "log_odds: max_range is not read from files; set it in Python"),
+        ("log_odds: {update: ray, hit: .8}", "LogOddsConfig(update='ray')"),
+        ("volume: {min_evidence: 1}", "VolumeConfig(min_evidence=1.0)"),
+        ("sensor: {max_depth: 5}\nsensor: {min_depth: 1}", "'sensor' stands twice"),
+        ("inference: {sweeps: 5, sweeps: 2}", "'sweeps' stands twice"),
+    ],
+)  # fmt: skip
+def test_what_a_file_sets_in_vain_is_an_error(
+    tmp_path: Path, text: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, text)
+    assert main(["map", "coffin_world:frames=2", "--out", str(tmp_path / "o"), "--config", str(path)]) == 2
+    assert f"{path}: " in (words := capsys.readouterr().err)
+    assert said in words
+
+
+def test_a_map_made_with_a_removed_parameter_is_read_with_a_warning() -> None:
+    values = {"inference": {"damping": 0.3, "sweeps": 2}}
+    with pytest.warns(UserWarning, match=r"a map: inference: damping is no longer a parameter: messages"):
+        found = from_dict(Config, values, "a map", of_map=True)
+    assert found == dataclasses.replace(Config(), inference=InferenceConfig(sweeps=2))
 
 
 def test_its_former_default_needs_no_warning(tmp_path: Path) -> None:
@@ -131,26 +159,6 @@ def names_in_files(cls: type) -> set[str]:
 def test_a_file_has_at_most_fifty_parameters() -> None:
     values = yaml.safe_load(commented_yaml(Config()))
     assert sum(len(value) if isinstance(value, dict) else 1 for value in values.values()) <= 50
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("visibility: {q_max: 0.8}", r"set it in Python, VisibilityConfig\(q_max=0.8\)"),
-        ("log_odds: {update: ray, hit: 0.8}", r"set it in Python, LogOddsConfig\(update='ray'\)"),
-        ("volume: {min_evidence: 1}", r"set it in Python, VolumeConfig\(min_evidence=1.0\)"),
-        ("keyframes: {against: all}", "against is no longer a parameter: a frame is compared with the last"),
-        (
-            "poses: {carry_unnamed: false}",
-            "carry_unnamed is no longer a parameter: frames without",
-        ),
-    ],
-)
-def test_what_files_no_longer_set_is_said_with_what_to_do(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.warns(UserWarning, match=said):
-        found = load(written(tmp_path, text))
-    hit = LogOddsConfig(hit=0.8 if "hit" in text else LogOddsConfig.hit)
-    assert found == dataclasses.replace(Config(), log_odds=hit)
 
 
 def test_the_defaults_of_what_they_no_longer_set_need_no_warning(tmp_path: Path) -> None:
@@ -266,6 +274,39 @@ def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
     config = load(written(tmp_path, "voxel_size: 1\ninference: {outlier_floor: 1e-6}"))
     assert config.voxel_size == 1.0
     assert config.inference.outlier_floor == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("length", "size_m"), [("5cm", 0.05), ("50 mm", 0.05), ("0.2m", 0.2), ("1e1cm", 0.1), ("0.05", 0.05)]
+)
+def test_a_voxel_size_may_have_its_unit(tmp_path: Path, length: str, size_m: float) -> None:
+    assert load(written(tmp_path, f"voxel_size: {length}")).voxel_size == size_m
+    for words in (
+        ["--voxel-size", length],
+        [f"--voxel_size={length}"],
+        ["--voxel-size=1cm", "--voxel-size", length],
+    ):
+        _, options = parse(["map", "x", "--out", "y", *words])
+        assert options.settings.voxel_size == size_m
+    assert parse(["bench", "--voxel-sizes", length, "2cm", "--frames", "3"])[1].voxel_sizes == (size_m, 0.02)
+
+
+@pytest.mark.parametrize("length", ["5c", "cm", "5 ccm", "5mcm", "5km", "five cm"])
+def test_what_is_no_length_is_an_error(tmp_path: Path, length: str) -> None:
+    with pytest.raises(ConfigError, match="voxel_size must be a number"):
+        load(written(tmp_path, f"voxel_size: {length}"))
+    with pytest.raises(ConfigError, match="parsing --voxel-size"):
+        parse(["map", "x", "--out", "y", "--voxel-size", length])
+
+
+@pytest.mark.parametrize("command", ["map", "live", "tune"])
+def test_a_voxel_size_that_nothing_gives_is_to_fit(tmp_path: Path, command: str) -> None:
+    words = [command, "x", "--out", str(tmp_path / "run")]
+    other, sized = tmp_path / "other.yaml", written(tmp_path, "voxel_size: 0.05")
+    other.write_text("inference: {sweeps: 2}", encoding="utf-8")
+    for more, fits in ([], True), (["--config", str(other)], True), (["--config", str(sized)], False):
+        assert parse([*words, *more])[1].settings.fit_voxel_size == fits
+        assert not parse([*words, *more, "--voxel-size", "0.05"])[1].settings.fit_voxel_size
 
 
 def test_tables_are_found_from_the_files_folder(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_depth_images_of_other_names(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_file_of_a_recording_alone(folder: Path, tmp_path: Path) -> None:
-    said = "unsupported file type; for a recording of many files pass its folder"
+    said = "is one file of a recording ("
     refused(folder / "camera.txt", str(folder / "camera.txt"), said)
     (tmp_path / "poses.csv").write_text("timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
     refused(tmp_path / "poses.csv", f"with --poses {tmp_path / 'poses.csv'}")

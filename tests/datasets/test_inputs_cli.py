@@ -103,6 +103,7 @@ def test_info_of_a_folder(tmp_path: Path) -> None:
     assert (status, errors) == (0, "")
     assert re.search(r"format +│ +7-Scenes", out)
     assert re.search(r"frames +│ +5", out)
+    assert re.search(r"voxel size +│ +5 cm fits", out)
     assert re.search(r"camera +│ +8 x 6, fx 10, fy 10, cx 4, cy 3", out)
     assert "one in 2 rows and columns is read" in out
     flags = ["--camera=20,20,8,6", "--image-scale=0.5"]

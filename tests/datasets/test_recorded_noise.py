@@ -12,8 +12,14 @@ from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.config.sections import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import StatedSensor
-from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR, with_recorded_noise, with_tuned_noise
+from taichi_mrf.datasets.recorded_noise import (
+    SHORT_RAYS_FLOOR,
+    proposed_voxel_size,
+    with_recorded_noise,
+    with_tuned_noise,
+)
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -119,3 +125,46 @@ def test_a_number_for_what_was_not_seen_is_no_measurement_or_is_said(
 def test_no_range_is_sought_without_bound() -> None:
     endless_m = Street("street", CAMERA, far_m=1e10)
     assert with_recorded_noise(Config(), endless_m).sensor.max_depth < 10_000
+
+
+@pytest.mark.parametrize(
+    ("median_m", "sigma_m", "size_m"),
+    [
+        (3.0, 0.0, 0.05),  # a room
+        (5.0, 0.0, 0.05),  # 1% of the depth
+        (6.2, 0.03, 0.1),  # a building by lidar
+        (13.3, 0.13, 0.2),  # a street by stereo
+        (13.3, 0.25, 0.5),
+        (40.0, 3.0, 5.0),
+        (0.3, 0.0, 0.02),  # things on a table: 10% of the depth
+        (0.3, 0.2, 0.02),
+    ],
+)
+def test_without_a_size_voxels_fit_depths_and_noise(median_m: float, sigma_m: float, size_m: float) -> None:
+    dataset = street(far_m=median_m, share=1.0, lambda_=sigma_m / median_m**2)
+    unset = replace(Config(), fit_voxel_size=True)
+    fitted = with_recorded_noise(unset, dataset)
+    assert (fitted.voxel_size, fitted.fit_voxel_size) == (size_m, False)
+    assert proposed_voxel_size(dataset) == size_m
+    said = [note for note in dataset.notes if note.startswith("voxel_size is")]
+    assert len(said) == (size_m != 0.05)
+    assert with_recorded_noise(Config(), street(far_m=median_m, share=1.0)).voxel_size == 0.05
+
+
+def test_without_depths_voxels_are_the_default() -> None:
+    blind = street()
+    blind.broken = range(blind.count)
+    fitted = with_recorded_noise(replace(Config(), fit_voxel_size=True), blind)
+    assert (fitted.voxel_size, fitted.fit_voxel_size) == (0.05, False)
+    assert with_recorded_noise(Config(5.0), blind).voxel_size == 5.0
+
+
+def test_voxels_larger_than_half_the_median_depth_are_a_slip() -> None:
+    room = street(far_m=3.0, share=1.0)
+    assert with_recorded_noise(Config(1.5), room).voxel_size == 1.5
+    with pytest.raises(
+        ConfigError, match=r"voxel_size is 5 m, .* 3 m: was 5cm meant\? --voxel-size 5cm fits"
+    ):
+        with_recorded_noise(Config(5.0), room)
+    with pytest.raises(ConfigError, match=r"was 50mm meant\? --voxel-size 5cm fits"):
+        with_recorded_noise(Config(50.0), room)

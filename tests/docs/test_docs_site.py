@@ -95,6 +95,37 @@ def test_the_plan_of_the_packages_is_made_from_the_table(site: Path) -> None:
     ]
 
 
+LINK = re.compile(r"\]\(\s*<?([^)>\s]+)|(?:src|href)=\"([^\"]+)\"|^\[[^\]]+\]:\s*(\S+)", re.MULTILINE)
+FENCED = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    plain = (
+        re.sub(r"[`*]|\]\([^)]*\)|\[", "", each) for each in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    )
+    return {re.sub(r"[^\w\- ]", "", each.strip().lower()).replace(" ", "-") for each in plain}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), REPOSITORY / "data" / "README.md"],
+    ids=lambda page: page.relative_to(REPOSITORY).as_posix(),
+)
+def test_every_relative_link_leads_somewhere_in_a_clone(page: Path) -> None:
+    dead = []
+    for match in LINK.finditer(FENCED.sub("", page.read_text(encoding="utf-8"))):
+        link = next(filter(None, match.groups()))
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if re.match("[a-z]+:", link):
+            continue
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            dead.append(link)
+    assert not dead
+
+
 def test_broken_links_and_anchors_end_the_build(tmp_path: Path) -> None:
     ours = yaml.safe_load((REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8"))
     broken = ["absent.md", "#nowhere", "/absolute", "other.md#missing"]

@@ -1,6 +1,8 @@
 """Views of a live run beside its map: rays, images of a view, and OctoMap's way with the same frames."""
 
 from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from live_scene import CONFIG, FakeLink, finished, map_voxels, room, session_of,
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.viewer.messages import Images, PixelRay, RayAnswer, RayThrough, Switch, Votes, Watch
+from taichi_mrf.viewer.messages import Images, Notice, PixelRay, RayAnswer, RayThrough, Switch, Votes, Watch
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -99,7 +101,8 @@ def test_images_of_a_view_are_small_and_scored() -> None:
     assert "no surface" in images[0].score
 
 
-def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:
+@pytest.mark.parametrize("kept", [{}, {"color": True, "keep_surface": True}])
+def test_octomaps_way_follows_the_keyframes_and_goes_away_again(kept: dict[str, Any]) -> None:
     def beside() -> set[tuple[int, int, int]]:
         return shown(link.sent).voxels("baseline")
 
@@ -111,9 +114,10 @@ def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:
         return map_voxels(m)
 
     link = FakeLink()
-    session = session_of(link)
+    session = session_of(link, config=replace(CONFIG, **kept))
     link.ask(Watch(images=False, view=None, baseline=True))
     finished(session)
+    assert [notice for notice in link.of_type(Notice) if notice.severity == "error"] == []
     assert beside() == log_odds_voxels(range(4))
     link.ask(Switch(1, on=False))
     finished(session)

@@ -381,6 +381,20 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
 
+def test_a_map_with_colours_has_a_baseline_without(browser: "Browser") -> None:
+    with (
+        LiveProgram(
+            ROOM, "--color", "--limit", "3", "--voxel-size", "8cm", "--runtime.arch", "cpu"
+        ) as program,
+        LivePage(browser, program.address) as page,
+    ):
+        page.until_settled()
+        page.tick("Show baseline")
+        page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")
+        page.screenshot("baseline_of_colours")
+        assert page.problems == []
+
+
 def test_a_link_begins_with_the_view_that_it_was_made_of(
     page: LivePage, program: LiveProgram, browser: "Browser"
 ) -> None:

@@ -8,22 +8,28 @@ from browser import LivePage, chromium, missing
 from live_program import LiveProgram
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system import runtime
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
+IDENTITY = np.eye(4)
 FAR_M = 40.0
 """Distance between the two recordings' rooms."""
 
 
-def write_recording(folder: Path, count: int, x_m: float) -> None:
-    """Some frames of the built-in room, which stands at ``x_m``."""
+Z_TO_MINUS_Y = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+
+
+def write_recording(folder: Path, count: int, x_m: float, T_other_world: Pose = IDENTITY) -> None:
+    """Some frames of the built-in room, which stands at ``x_m``, in another world."""
     runtime.init("cpu")
     dataset = open_dataset(f"synthetic:room?frames={count}&width=96&height=72")
     frames, poses = [dataset.read(i) for i in range(count)], []
     for frame in frames:
         poses.append(frame.T_world_camera.copy())
         poses[-1][0, 3] += x_m
+        poses[-1] = T_other_world @ poses[-1]
     camera = frames[0].camera
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     folder.mkdir()
@@ -61,4 +67,27 @@ def test_another_recording_is_mapped_in_the_same_page(tmp_path: Path) -> None:
         page.tab("About")
         seen = page.until(lambda seen: "source" in seen.table, "the figures")
         assert seen.table["source"] == str(tmp_path / "second")
+        assert page.problems == []
+
+
+def test_a_level_cut_keeps_what_lies_below_it_in_a_world_whose_y_points_down(tmp_path: Path) -> None:
+    size_m, height_m = 0.08, -0.3
+    write_recording(tmp_path / "down", 3, 0.0, Z_TO_MINUS_Y)
+    flags = ("--voxel-size", f"{size_m}", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
+    with (
+        LiveProgram(tmp_path / "down", *flags) as program,
+        chromium() as browser,
+        LivePage(browser, program.address) as page,
+    ):
+        page.until_settled()
+        rows = np.floor(page.saved_map(tmp_path).decided.voxels(0.5)[0][:, 1] / size_m)
+        page.tab("Map")
+        page.until(lambda seen: seen.settled and seen.voxels == len(rows), "what is occupied")
+        page.select("Look", "free and unknown space")
+        page.until(lambda seen: page.input("Cut axis").input_value() == "y", "a level cut")
+        page.slide("Cut at (m)", height_m)
+        below = int((rows >= np.floor(-height_m / size_m)).sum())
+        assert 0 < below < len(rows)
+        page.until(lambda seen: seen.agrees and seen.voxels == below, "the voxels below the cut")
+        page.screenshot("level_cut_of_y_down")
         assert page.problems == []

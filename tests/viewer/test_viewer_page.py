@@ -140,6 +140,27 @@ def test_undo_and_redo_are_offered_where_they_do_something(handled: LivePage) ->
     assert not history.visible
 
 
+def test_at_first_all_keyframes_are_switched_and_a_chosen_range_stays(handled: LivePage) -> None:
+    handled.take(keyframe(2, 2.0))
+    handled.act("All off")
+    assert handled.asked == [m.Switch(0, on=False, last=2)]
+    handled.page.panel.range.value = (1.0, 2.0)
+    handled.take(keyframe(3, 3.0))
+    handled.act("All off")
+    assert handled.asked[1:] == [m.Switch(1, on=False, last=2)]
+
+
+def test_what_the_mapping_process_gives_up_is_not_ticked_any_more(handled: LivePage) -> None:
+    handled.page.panel.view_options.handles["show_baseline"].value = True
+    handled.page._take_options()
+    handled.take(m.Notice("baseline: out of memory", "error"))
+    assert handled.page.options.show_baseline
+    handled.take(m.Notice("baseline: out of memory", "error", gives_up="baseline"))
+    assert not handled.page.options.show_baseline
+    assert not handled.page.panel.view_options.handles["show_baseline"].value
+    assert [each.baseline for each in handled.asked if isinstance(each, m.Watch)] == [True, False]
+
+
 def test_the_chosen_keyframe_has_a_thumbnail(handled: LivePage) -> None:
     picture = np.full((2, 2, 3), 77, np.uint8)
     handled.take(replace(keyframe(1), picture=picture))
@@ -225,6 +246,20 @@ def test_free_space_is_seen_in_a_cut_that_goes_with_the_look(handled: LivePage) 
     handles["look"].value = "free and unknown space"
     page._take_options()
     assert page.options.cut_axis == "x"
+
+
+def test_a_level_cut_keeps_the_lower_half_where_y_points_down(handled: LivePage) -> None:
+    take_both_maps(handled)
+    page, handles = handled.page, handled.page.panel.view_options.handles
+    page._flush()
+    handles["look"].value = "free and unknown space"
+    page._take_options()
+    slider, size = handles["cut_at_m"], HELLO.voxel_size
+    assert (page.options.cut_axis, slider.min, slider.max) == ("y", pytest.approx(-8 * size), 0.0)
+    assert page.options.cut_at_m == pytest.approx(-4 * size)
+    page._flush()
+    y = page.map.layers["map"].points()[:, 1] / size
+    np.testing.assert_array_equal(np.unique(np.round(y - 0.5)), np.arange(4, 8))
 
 
 def test_reset_asks_before_it_deletes_a_map(handled: LivePage, browser: RawClient) -> None:
@@ -406,9 +441,9 @@ def test_the_map_of_another_recording_is_looked_at_anew(
 @pytest.mark.parametrize("flipped", [False, True])
 def test_a_cut_parts_the_map_from_the_baseline(handled: LivePage, flipped: bool) -> None:
     take_both_maps(handled)
-    at_m = 3.5 * HELLO.voxel_size
+    at_m = -3.5 * HELLO.voxel_size  # its height: y points down
     cut = ViewOptions(show_baseline=True, cut_axis="y", cut_at_m=at_m, flip_cut=flipped)
-    for options, many in ((ViewOptions(show_baseline=True), (8, 8)), (cut, (5, 3) if flipped else (4, 4))):
+    for options, many in ((ViewOptions(show_baseline=True), (8, 8)), (cut, (4, 4) if flipped else (5, 3))):
         handled.page.options = options
         handled.page.map.look_changed()
         handled.page._flush()

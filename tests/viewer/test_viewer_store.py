@@ -1,10 +1,13 @@
 """The viewer's copy of a map: what is put in comes out, whatever the history; cuts and slabs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.map_scene import brick_edges
@@ -132,12 +135,18 @@ def test_the_cut_shows_free_occupied_and_unknown_where_they_are(axis: int) -> No
 
 def test_the_cut_goes_from_one_end_of_the_map_to_the_other() -> None:
     store = VoxelStore()
-    assert cut_of(ViewOptions(cut_axis="x"), store, 0.1) is None
+    assert cut_of(ViewOptions(cut_axis="x"), store, Z_UP, 0.1) is None
     put_block(store, -2, 0, 0)
     put_block(store, 3, 0, 0)
-    assert cut_of(ViewOptions(), store, 0.1) is None
+    assert cut_of(ViewOptions(), store, Z_UP, 0.1) is None
     for at_m, voxel in ((-5.0, -16), (0.3, 3), (0.39, 3), (5.0, 31)):
-        assert cut_of(ViewOptions(cut_axis="x", cut_at_m=at_m), store, 0.1) == Cut(0, voxel)
+        options = ViewOptions(cut_axis="x", cut_at_m=at_m)
+        for up in (Z_UP, (0, 1), (1, -1)):
+            assert cut_of(options, store, up, 0.1) == Cut(0, voxel)
+        # Where x points down, the cut is at a height, and opens the map from above as elsewhere.
+        options = ViewOptions(cut_axis="x", cut_at_m=-at_m)
+        assert cut_of(options, store, (0, -1), 0.1) == Cut(0, voxel, flipped=True)
+        assert cut_of(replace(options, flip_cut=True), store, (0, -1), 0.1) == Cut(0, voxel)
 
 
 @given(st.sets(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=12))

@@ -13,11 +13,16 @@ from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
+from taichi_mrf.system import runtime
 
 LEARNT = ("sensor.sigma_scale", "sensor.sigma_added", "inference.surface_density", "inference.outlier_floor")
 """The parameters that --noise auto changes."""
+
+_RECORDED = ("voxel_size", "fit_voxel_size", "sensor.sigma", "sensor.max_depth", "inference.outlier_floor")
+"""The parameters that a run may have had from the recording."""
 
 _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
 
@@ -107,9 +112,9 @@ def _changed_parameters(task: MapTask) -> list[str]:
     """The names of the parameters in which the task differs from the run in its folder."""
     held = load(task.out / CONFIG_FILE)
     changed = differences(held, task.settings)
-    if {"sensor.sigma", "sensor.max_depth", "inference.outlier_floor"} & set(
-        changed
-    ):  # the run may have had it from the recording
+    if set(_RECORDED) & set(changed):
+        if is_rendered(task.source):
+            runtime.init(task.settings.runtime.arch, task.settings.runtime.threads)
         changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
     return [name for name in changed if not (name in LEARNT and _learns_noise(task))]
 

@@ -55,7 +55,7 @@ class Calibrate:
     true_depth_scale: float | None = None
     """Steps per metre in the true depth, if different."""
 
-    no_returns: bool = False
+    no_returns: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Also learn the probability of no return (``sensor.no_return: model``), from pixels that have a true
     depth and no measured one. Needs --true-depth."""
 

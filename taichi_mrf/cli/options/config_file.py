@@ -6,7 +6,7 @@ Flags change them, so that this file is read before the command line is parsed.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -28,23 +28,24 @@ class _Files:
 
 
 def mapping_parameters(arguments: Sequence[str]) -> Config:
-    """The parameters of --config, with --resume those of the run in --out, else the defaults.
-
-    Raises ConfigError.
-    """
+    """The parameters of --config, with --resume those of the run in --out, else the defaults. Where none of
+    them, nor a flag, gives a voxel size, it is to fit the recording. Raises ConfigError."""
     files = _files(arguments)
-    if files.config is not None:
-        return load(files.config)
-    if files.resume and files.out is not None and (files.out / CONFIG_FILE).is_file():
-        return load(files.out / CONFIG_FILE)
-    return Config()
+    path, config = files.config, Config()
+    if path is None and files.resume and files.out is not None and (files.out / CONFIG_FILE).is_file():
+        path = files.out / CONFIG_FILE
+    if path is not None:
+        config = load(path)
+    flags = {word.partition("=")[0].replace("_", "-") for word in arguments}
+    given = "--voxel-size" in flags or (path is not None and "voxel_size" in _values(path))
+    return replace(config, fit_voxel_size=not given)
 
 
 def live_parameters(arguments: Sequence[str]) -> Config:
     """The parameters for a live run, whose world changes, unless the file sets ``time.half_life_s``. Raises
     ConfigError."""
     path, config = _files(arguments).config, mapping_parameters(arguments)
-    if path is not None and "half_life_s" in _section(path, "time"):
+    if path is not None and "half_life_s" in (_values(path).get("time") or {}):
         return config
     return replace(config, time=replace(config.time, half_life_s=LIVE_HALF_LIFE_S))
 
@@ -65,9 +66,9 @@ def load_laser_config(path: Path) -> LaserConfig:
     return from_dict(LaserConfig, read_yaml(path), str(path))
 
 
-def _section(path: Path, name: str) -> dict[str, object]:
-    """Entries that a file, which has been read without errors, sets in a section."""
-    return (read_yaml(find_config(path)) or {}).get(name) or {}
+def _values(path: Path) -> dict[str, Any]:
+    """The values of a file that has been read without errors."""
+    return read_yaml(find_config(path)) or {}
 
 
 def _files(arguments: Sequence[str]) -> _Files:

@@ -121,6 +121,13 @@ class Page(BasePage[Panel]):
         if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
 
+    def notify(self, notice: m.Notice) -> None:
+        """Show a notice, and no box as ticked for what there is no more."""
+        super().notify(notice)
+        if notice.gives_up:
+            self.panel.view_options.handles[f"show_{notice.gives_up}"].value = False
+            self._take_options()
+
     def look_from(self, side: Side, client: int) -> None:
         """Show the whole map to one client, and follow the camera no more."""
         self.panel.set_following(False)

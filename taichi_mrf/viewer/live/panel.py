@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import LOOKS, LookName, ViewOptions
+from taichi_mrf.viewer.scene.coloring import ViewOptions, looks_of
 from taichi_mrf.viewer.scene.keyframe_layer import draw_lines
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
@@ -98,6 +98,7 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
+        self._all = (0.0, 0.0)
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         hint = "Map another recording of this folder; unsaved changes are asked about first."
@@ -148,7 +149,7 @@ class Panel(BasePanel):
         self._hello = hello
         self.show_recording(hello)
         self.time.begin(hello.has_dates)
-        self.view_options.offer("look", _looks_of(hello))
+        self.view_options.offer("look", looks_of(hello))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -218,8 +219,11 @@ class Panel(BasePanel):
         listed = [keyframes[id] for id in sorted(keyframes)]
         self._names = {f"{each.id}: {each.name} ({each.state})": each.id for each in listed}
         self.keyframe.options = list(self._names) or [NO_KEYFRAME]
-        name = next((name for name, id in self._names.items() if id == chosen), None)
-        self.keyframe.value = name or self.keyframe.options[0]
+        before, self._all = self._all, (float(min(keyframes, default=0)), float(max(keyframes, default=0)))
+        if self.range.value == before:  # as long as nobody has chosen another
+            self.range.value = self._all
+        names = (name for name, id in self._names.items() if id == chosen)
+        self.keyframe.value = next(names, self.keyframe.options[0])
         fixed = chosen is None or keyframes[chosen].state == "frozen"
         for widget in (self.position, self.pixel, self._pixel_button):
             change(widget, disabled=fixed)
@@ -284,8 +288,8 @@ class Panel(BasePanel):
         )
         self._keyframe_text = gui.add_markdown("")
         self._thumbnail = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
-        hint = "Numbers of the first and the last keyframe that the buttons below switch."
-        self.range: Any = gui.add_vector2("From, to", (0.0, 0.0), min=(0.0, 0.0), step=1.0, hint=hint)
+        hint = "Numbers of the first and the last keyframe that the buttons below switch; at first all."
+        self.range: Any = gui.add_vector2("From, to", self._all, min=(0.0, 0.0), step=1.0, hint=hint)
         hint = "Remove all these keyframes from the map, or add them again; Undo takes that back at once."
         self.add_buttons("Several", ("All off", "All on"), hint)
         gui.add_markdown(
@@ -304,8 +308,8 @@ class Panel(BasePanel):
 
     def _images_tab(self) -> None:
         gui = self.gui
-        hint = "Keep them up to date while mapping."
-        self.images = self.watch(gui.add_checkbox("Show images", False, hint=hint))
+        box = gui.add_checkbox("Show images", False, hint="Keep them up to date while mapping.")
+        self.images = self.watch(box)
         self.view = self.watch(gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
         self._score = gui.add_markdown("")
         labels = {
@@ -315,20 +319,6 @@ class Panel(BasePanel):
         }
         black = np.zeros((2, 2, 3), np.uint8)
         self._pictures = {n: gui.add_image(black, label=label, visible=False) for n, label in labels.items()}
-
-
-def _looks_of(hello: m.Hello) -> tuple[LookName, ...]:
-    """The looks that a map has the data for."""
-    lacking: set[str] = set()
-    lacking |= set() if hello.has_surface else {"surface"}
-    lacking |= set() if hello.counts_keyframes else {"keyframes"}
-    lacking |= set() if hello.has_dates else {"changes"}
-    photo = hello.has_colors
-    return tuple(
-        look
-        for look, (shows, by) in LOOKS.items()
-        if not {shows, by} & lacking and (photo or by != "photo" or shows == "points")
-    )
 
 
 class TimeFolder:

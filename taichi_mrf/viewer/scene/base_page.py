@@ -172,6 +172,8 @@ class BasePage(Generic[P]):
         """Let the cut go from one end of the map to the other."""
         ends_m, axis = None if self.map is None else self.map.layers["map"].ends_m(), self.options.cut_axis
         along = None if ends_m is None or axis == "none" else ends_m[:, "xyz".index(axis)]
+        if along is not None and self.viewpoint.up == ("xyz".index(axis), -1):  # heights
+            along = -along[::-1]
         self.panel.show_cut(along, in_middle)
 
     def _flush(self) -> None:

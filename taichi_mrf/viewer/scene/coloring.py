@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.method import Range
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Hello
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
@@ -82,10 +82,11 @@ class ViewOptions:
     unknown (nothing)."""
 
     cut_at_m: Annotated[float, Range(-1.0, 1.0, 0.01)] = 0.0
-    """Coordinate of the cut on its axis, in metres; the slider goes from one end of the map to the other."""
+    """Coordinate of the cut on its axis in metres, of a level cut the height; the slider goes from one end of
+    the map to the other."""
 
     flip_cut: bool = False
-    """Hide what lies before the cut, and not what lies behind it."""
+    """Hide what lies before the cut, and not what lies behind it: below a level cut, and not above it."""
 
     bricks: bool = False
     """Draw the outlines of the map's bricks of 8 x 8 x 8 voxels."""
@@ -115,6 +116,21 @@ class ViewOptions:
     def color_by(self) -> ColorBy:
         """Meaning of the look's colour."""
         return LOOKS[self.look][1]
+
+
+def looks_of(hello: Hello) -> tuple[LookName, ...]:
+    """The looks that a map has the data for."""
+    needs = (
+        (hello.has_surface, "surface"),
+        (hello.counts_keyframes, "keyframes"),
+        (hello.has_dates, "changes"),
+    )
+    lacking, photo = {name for has, name in needs if not has}, hello.has_colors
+    return tuple(
+        look
+        for look, (shows, by) in LOOKS.items()
+        if not {shows, by} & lacking and (photo or by != "photo" or shows == "points")
+    )
 
 
 _MAPS: dict[ColorBy, str] = {

@@ -38,15 +38,18 @@ _WXYZ = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 _AXES = ((1, 2), (2, 0), (0, 1))
 
 
-def cut_of(options: ViewOptions, store: VoxelStore, voxel_size: float) -> Cut | None:
-    """The cut that is asked for, through a layer of the map's voxels; None without, and for an empty map."""
+def cut_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Cut | None:
+    """The cut that is asked for, through a layer of the map's voxels; None without, and for an empty map. A
+    level cut opens the map from above, wherever that is."""
     bounds = store.bounds()
     if bounds is None or options.cut_axis == "none":
         return None
     axis = "xyz".index(options.cut_axis)
     low, high = int(bounds[0][axis]) * BRICK, int(bounds[1][axis] + 1) * BRICK - 1
-    voxel = int(np.floor(options.cut_at_m / voxel_size + 1e-6))
-    return Cut(axis, min(max(voxel, low), high), options.flip_cut)
+    downwards = up == (axis, -1)
+    at_m = -options.cut_at_m if downwards else options.cut_at_m
+    voxel = int(np.floor(at_m / voxel_size + 1e-6))
+    return Cut(axis, min(max(voxel, low), high), options.flip_cut != downwards)
 
 
 def cut_picture(
@@ -301,7 +304,7 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
     """How the voxels of a map look."""
     return Look(
         log_odds=float(np.log(options.threshold / (1 - options.threshold))),
-        cut=cut_of(options, store, voxel_size),
+        cut=cut_of(options, store, up, voxel_size),
         scale=scale_of(
             options.color_by,
             options.threshold,
