@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from taichi_mrf.viewer.scene.keyframe_layer import (
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
-from taichi_mrf.voxels.colors import NO_COLOR, marginal_colors
+from taichi_mrf.voxels.colors import NO_COLOR
 
 HEIGHTS = (0.0, 2.0)
 
@@ -47,16 +48,28 @@ def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
     )
 
 
-def test_marginals_have_the_colours_of_the_files_and_pictures() -> None:
-    p = np.linspace(0.5, 0.9999, 200)
-    log_odds = np.log(p / (1 - p))
-    colors = voxel_colors(scale_of("probability", 0.5, HEIGHTS), shown(log_odds), np.zeros(200))
-    # The log-odds are rounded to 1/512, which is at most one of 256 colours.
-    assert np.abs(colors.astype(int) - marginal_colors(p)).max() <= 4
+def test_chances_have_their_colours_and_those_between_are_blended() -> None:
+    chances = {0.5: (240, 110, 40), 0.9: (247, 190, 95), 0.99: (150, 200, 180), 0.999: (60, 140, 190)}
+    p = np.array(list(chances))
+    scale = scale_of("probability", 0.5, HEIGHTS)
+    colors = voxel_colors(scale, shown(np.log(p / (1 - p))), np.zeros(4)).astype(int)
+    # 256 colours, and the log-odds are rounded to 1/512.
+    assert np.abs(colors - list(chances.values())).max() <= 2
+    between = voxel_colors(scale, shown(np.array([1.0986])), np.zeros(1)).astype(int)  # 3 in 4
+    assert np.abs(between - (colors[0] + colors[1]) / 2).max() <= 2
+    unlikely = scale_of("probability", 0.2, HEIGHTS)
+    assert np.abs(voxel_colors(unlikely, shown(np.zeros(1)), np.zeros(1)).astype(int) - colors[0]).max() <= 2
+
+
+def test_the_legend_of_chances_reads_in_chances() -> None:
+    likely, every = (legend_html(scale_of("probability", least, HEIGHTS)) for least in (0.5, 0.2))
+    assert re.findall("<span>(.*?)</span>", likely) == ["1 in 2", "9 in 10", "99 in 100", "999 in 1000"]
+    assert re.findall("<span>(.*?)</span>", every) == ["1 in 1000", "1 in 2", "999 in 1000"]
+    assert "chance that a voxel is occupied" in likely
 
 
 def test_the_scale_reaches_down_when_improbable_voxels_are_shown() -> None:
-    assert scale_of("probability", 0.5, HEIGHTS).low == 0.5
+    assert scale_of("probability", 0.5, HEIGHTS).low == 0.0
     low = scale_of("probability", 0.2, HEIGHTS)
     dark = voxel_colors(low, shown(np.array([-20.0])), np.zeros(1))
     np.testing.assert_array_equal(dark[0], low.colors[0])
@@ -107,7 +120,7 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
 
 
-@pytest.mark.parametrize("color_by", ["probability", "height", "uncertainty", "keyframes", "changes"])
+@pytest.mark.parametrize("color_by", ["height", "uncertainty", "keyframes", "changes"])
 def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
     scale = scale_of(color_by, 0.5, HEIGHTS)
     text = legend_html(scale)

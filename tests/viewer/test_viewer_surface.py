@@ -132,12 +132,18 @@ def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePa
     assert drawn.asked == [m.Watch(False, None, False, surface=True)]  # the page opens with it
     drawn.take(patch())
     assert drawn.draw() == "512 voxels shown"  # some of it may still be on its way
+    scene = drawn.page.map
+    assert scene is not None
+    assert scene.scale is not None
+    assert scene.scale.color_by == "probability"  # voxels show how sure the map is while it grows
     drawn.take(VIEW)
     assert drawn.draw() == "2 triangles of the measured surface shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
     vertices, triangles, _ = drawn.mesh()
     np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)
+    assert scene.scale.color_by == "height"
     assert drawn.draw(look="voxels by height") == "512 voxels shown"
+    assert scene.scale.color_by == "height"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (True, False)
     drawn.take(patch(empty=True))
     assert drawn.draw() == "512 voxels shown"

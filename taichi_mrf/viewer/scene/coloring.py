@@ -1,7 +1,9 @@
 """View options, colours of voxels and their legend. No page is needed to import them.
 
 The page's widgets are made from the options: a field's docstring is its help text, its range the slider's.
-Heights have the colours that they have in a run's pictures; all other colour scales are perceptually uniform.
+Heights have the colours that they have in a run's pictures. Probabilities are on a scale of log-odds that is
+warm where the map is unsure and calm where it is sure, so that one watches it become sure. All other colour
+scales are perceptually uniform.
 """
 
 import base64
@@ -66,7 +68,7 @@ class ViewOptions:
     """Show the surface that the keyframes measured, which is finer than voxels; the voxels of the map; the
     space that is known to be free, in a cut; the points that the chosen keyframe measured; or what moves, in
     red, with boxes around what appeared and left. The surface is made when no frames are read, at the end or
-    while paused; until then voxels are shown in its place."""
+    while paused; until then voxels are shown in its place, coloured by how sure the map is of them."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5
     """Show voxels whose probability of being occupied is at least this."""
@@ -133,8 +135,17 @@ def looks_of(hello: Hello) -> tuple[LookName, ...]:
     )
 
 
+CHANCES: dict[str, tuple[float, tuple[int, int, int]]] = {
+    "1 in 1000": (-6.907, (125, 130, 140)),
+    "1 in 10": (-2.197, (196, 178, 160)),
+    "1 in 2": (0.0, (240, 110, 40)),
+    "9 in 10": (2.197, (247, 190, 95)),
+    "99 in 100": (4.595, (150, 200, 180)),
+    "999 in 1000": (6.907, (60, 140, 190)),
+}
+"""Chances that a voxel is occupied, as log-odds, and their colours; those between are blended."""
+
 _MAPS: dict[ColorBy, str] = {
-    "probability": "viridis",
     "height": "Spectral_r",
     "uncertainty": "magma",
     "keyframes": "plasma",
@@ -177,6 +188,8 @@ class Scale:
     high: float
     label: str
     table: NDArray[np.uint8] | None = field(default=None, compare=False)
+    marks: tuple[str, ...] = ()
+    """Words at even distances from the low to the high end, in place of their numbers."""
 
     @cached_property
     def shaded(self) -> NDArray[np.uint8]:
@@ -188,8 +201,10 @@ def scale_of(
     color_by: ColorBy, threshold: float, heights_m: tuple[float, float], most_keyframes: int = 1
 ) -> Scale:
     """The scale of a mode. ``heights_m`` are the lowest and the highest height, ``most_keyframes`` is the
-    largest number of keyframes that see a voxel. Marginals begin at one half, or at 0 if less probable voxels
-    are shown; counts of keyframes are on a logarithmic scale that ends at a power of two."""
+    largest number of keyframes that see a voxel. Log-odds begin at even chances, or far below if less
+    probable voxels are shown; counts of keyframes are on a logarithmic scale that ends at a power of two."""
+    if color_by == "probability":
+        return _chances(shows_unlikely=threshold < LOWEST)
     colors = _colors(color_by)
     if color_by in ("height", "changes"):
         return Scale(color_by, colors, *heights_m, "height (m)")
@@ -200,11 +215,23 @@ def scale_of(
         return Scale(color_by, colors, 1.0, float(2**doublings), label, _numbers(share))
     if color_by == "photo":
         return Scale(color_by, colors, 0.0, 1.0, PHOTO_LABEL)
-    p = probabilities()
-    if color_by == "uncertainty":
-        return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
-    low = LOWEST if threshold >= LOWEST else 0.0
-    return Scale(color_by, colors, low, 1.0, "probability", _numbers((p - low) / (1.0 - low)))
+    return Scale(
+        color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(probabilities()))
+    )
+
+
+@cache
+def _chances(shows_unlikely: bool) -> Scale:
+    """The scale of log-odds, from even chances on or with those below."""
+    named = list(CHANCES) if shows_unlikely else list(CHANCES)[2:]
+    at = [CHANCES[name][0] for name in named]
+    steps = np.linspace(at[0], at[-1], 256)
+    channels = np.transpose([CHANCES[name][1] for name in named])
+    colors = np.stack([np.rint(np.interp(steps, at, each)) for each in channels], axis=1).astype(np.uint8)
+    log_odds = np.arange(65536, dtype=np.uint16).view(np.int16) * LOG_ODDS_STEP
+    table = _numbers((log_odds - at[0]) / (at[-1] - at[0]))
+    marks = (named[0], "1 in 2", named[-1]) if shows_unlikely else tuple(named)
+    return Scale("probability", colors, at[0], at[-1], "chance that a voxel is occupied", table, marks)
 
 
 @cache
@@ -260,13 +287,15 @@ def legend_html(scale: Scale) -> str:
     if scale.color_by == "photo":
         return f'<div style="padding:0 0.75em;font-size:0.85em">{scale.label}</div>'
     strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
+    named = scale.marks or (f"{scale.low:.3g}", scale.label, f"{scale.high:.3g}")
+    below = f'<div style="text-align:center">{scale.label}</div>' if scale.marks else ""
     png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
     return (
         '<div style="padding:0 0.75em;font-size:0.85em">'
         f'<img alt="{scale.label}" style="width:100%;height:0.9em;image-rendering:pixelated" '
         f'src="data:image/png;base64,{png}">'
         '<div style="display:flex;justify-content:space-between">'
-        f"<span>{scale.low:.3g}</span><span>{scale.label}</span><span>{scale.high:.3g}</span></div></div>"
+        f"{''.join(f'<span>{name}</span>' for name in named)}</div>{below}</div>"
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer, MeasuredPoints, SceneChange
-from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, Scale, Show, ViewOptions
+from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, LookName, Scale, Show, ViewOptions
 from taichi_mrf.viewer.scene.keyframe_layer import draw_lines, placement
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
@@ -39,6 +39,9 @@ _LOWEST_SHARE = 0.02
 
 _SQUARES_ACROSS = 8
 """The ground has about so many squares along the map's longer side."""
+
+GROWING: tuple[LookName, LookName] = ("surface by height", "voxels by probability")
+"""A look, and the one that takes its place until the surface is there."""
 
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 _OUTLINE_COLOR = (120, 120, 120)
@@ -188,10 +191,12 @@ class MapScene:
         if waited is None or waited > 0:
             return False
         rested = time.monotonic() >= self._news_at + REST_S
+        self._shows = options.shows
+        if options.look == GROWING[0] and not self.shows_surface:
+            options = replace(options, look=GROWING[1])
         look = look_of(options, self.store, up, self._hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
-        self._shows = options.shows
         map_changed = everything or bool(self.layers["map"].changed)
         any_changed = map_changed or bool(self.layers["baseline"].changed)
         # A cut parts two maps: this one on its one side, the baseline's on the other.
