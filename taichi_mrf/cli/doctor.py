@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 
 from taichi_mrf.cli.options.doctor import Doctor
-from taichi_mrf.cli.shared.output import READ_WRONG
-from taichi_mrf.cli.shared.terminal import Terminal
+from taichi_mrf.cli.shared.terminal import READ_WRONG, Terminal
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.doctor.diagnosis import Diagnosis
 from taichi_mrf.doctor.picture import overlap

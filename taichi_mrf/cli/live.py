@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
-from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
-from taichi_mrf.cli.shared.terminal import print_problem
+from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, print_problem
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.runs.files import holds_run

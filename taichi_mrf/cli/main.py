@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import taichi_mrf
 from taichi_mrf.cli.parser import parse
-from taichi_mrf.cli.shared.output import READ_WRONG
-from taichi_mrf.cli.shared.terminal import PROGRAM, print_problem
+from taichi_mrf.cli.shared.terminal import PROGRAM, READ_WRONG, print_problem
 from taichi_mrf.errors import ReadWrongError, TaichiMRFError
 
 BAD_INPUT = 2

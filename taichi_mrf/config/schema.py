@@ -244,8 +244,7 @@ class Config:
     """All parameters of mapping a sequence: those that every method shares, and a section for each method."""
 
     voxel_size: float = 0.05
-    """Side of a voxel in metres, or with its unit: 5cm. Without it commands take 5 cm, or what fits the
-    recording's depths and noise."""
+    """Side of a voxel, in metres or as 5cm. Unset: 5 cm, or what the recording's depths call for."""
 
     method: MethodName = field(
         default=next(iter(METHODS)),

@@ -29,10 +29,10 @@ from taichi_mrf.cli.map.summary import (
 from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
-from taichi_mrf.cli.shared.output import DID_NOT_FIT, READ_WRONG, output_folder
+from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
-from taichi_mrf.cli.shared.terminal import Terminal, print_problem
+from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, READ_WRONG, Terminal, print_problem
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences

@@ -44,8 +44,8 @@ class NoiseFlags:
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
     """given: sigma of the parameters. auto: learnt first, from up to 60 frames, and kept in DIR/sensor.yaml
-    for other recordings. checked: given, but map learns it if 8 to 16 frames contradict the default,
-    or show that a stated one is three times too small."""
+    for other recordings. checked: given, but map learns it if 8 to 16 frames contradict the default
+    or find a stated one three times too small."""
 
     @property
     def is_learnt(self) -> bool:

@@ -17,12 +17,6 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.system.atomic import atomic_path, remove_leftovers
 from taichi_mrf.system.files import exists, is_folder
 
-DID_NOT_FIT = 3
-"""Exit status of a run that ran out of memory: the map of the frames that fit was saved."""
-
-READ_WRONG = 4
-"""Exit status for a recording that is surely not read as it was written, or whose map it contradicts."""
-
 LOCK_FILE = ".lock"
 
 _RETRY_S = 0.2

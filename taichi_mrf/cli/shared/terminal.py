@@ -12,6 +12,12 @@ from rich.text import Text
 
 PROGRAM = "taichi-mrf"
 
+DID_NOT_FIT = 3
+"""Exit status of a run that ran out of memory: the map of the frames that fit was saved."""
+
+READ_WRONG = 4
+"""Exit status for a recording that is surely not read as it was written, or whose map it contradicts."""
+
 
 def printable(text: str) -> str:
     """The text with every character that a terminal could obey, tabs and line breaks apart, as an escape."""
