@@ -36,14 +36,15 @@ def received(*numbers: int) -> tuple[StopRequest, list[str]]:
 def test_ctrl_c_asks_once_and_leaves_time() -> None:
     request, printed = received(signal.SIGINT)
     assert (request.signal, request.hurried, request.out_of_time()) == (signal.SIGINT, False, False)
-    assert printed == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
+    still = "What is mapped so far is still inferred, saved and checked, as the progress says."
+    assert printed == [f"Stopping. {still} Press Ctrl-C again to abort."]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_and_sighup_leave_seconds(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     request, printed = received(number)
     assert (request.signal, request.hurried, request.out_of_time()) == (number, True, False)
-    assert len(printed) == 1
+    assert printed == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
     monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
     assert request.out_of_time()
 

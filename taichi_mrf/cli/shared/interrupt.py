@@ -111,10 +111,15 @@ def interrupt_on_signals(announce: Callable[[str], None]) -> Iterator[StopReques
 @contextmanager
 def _handled(announce: Callable[[str], None], keeps: bool, raise_at_once: bool) -> Iterator[StopRequest]:
     request = StopRequest()
-    outcome = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
     announcing: list[threading.Thread] = []
 
     def announce_outcome() -> None:
+        if not keeps:
+            outcome = "Nothing is saved: there is no --out."
+        elif request.hurried or raise_at_once:
+            outcome = "What is done so far is saved."
+        else:
+            outcome = "What is mapped so far is still inferred, saved and checked, as the progress says."
         with contextlib.suppress(OSError):  # the terminal may be gone
             announce(f"Stopping. {outcome} Press Ctrl-C again to abort.")
 
