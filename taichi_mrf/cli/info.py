@@ -266,6 +266,7 @@ def _run_map(path: Path) -> Facts:
     with open_map_file(path) as file:
         header, bricks = read_header(path, file), file.array("bricks", "i", (None, 3))
         method = method_of(file)
+        file.check()
         parked = len(file.array("parked", "U", (None,))) if "parked" in file else 0
     names = [keyframe.name for keyframe in header.keyframes]
     stamps = [keyframe.stamp_s for keyframe in header.keyframes]

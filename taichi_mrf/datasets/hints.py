@@ -111,14 +111,15 @@ def hint_for(path: Path) -> str | None:
     if scans:
         names = ", ".join(child.name for child in scans[:8])
         return f"contains 2D laser scans; pass one of {names} to taichi-mrf laser"
-    kinds = {kind for child in children if (kind := _kind(child))}
+    kinds = [kind for child in children if (kind := _kind(child))]
     below = [file for child in sorted(path.iterdir()) if is_folder(child) for file in _first_files(child)]
     images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
     unread = [
         file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in (".exr", ".npy", ".pfm")
     ]
-    if len(kinds) == 1 and not ((images or unread) and _POSES_ONLY in next(iter(kinds))):
-        return kinds.pop()
+    most = kinds[0] if len(set(kinds)) == 1 and 2 * len(kinds) >= len(children) else None
+    if most and not ((images or unread) and _POSES_ONLY in most):
+        return most
     if unread:
         return _kind(unread[0])
     return image_hint(images, "holds images") if images else None

@@ -101,11 +101,14 @@ class ReadOptions:
         return round(1 / self.image_scale)
 
 
-def require(options: object, **least: float) -> None:
-    """Raise ConfigError for the first of these fields that is less than its least value."""
-    for name, value in least.items():
+def require(options: object, **bounds: float | tuple[float, float]) -> None:
+    """Raise ConfigError for the first of these fields that is less than its least value, or more than its
+    largest if there are two."""
+    for name, bound in bounds.items():
+        least, most = bound if isinstance(bound, tuple) else (bound, math.inf)
         given = getattr(options, name)
-        check_field(given >= value, name, f"must be at least {value}, not {given}")
+        check_field(given >= least, name, f"must be at least {least}, not {given}")
+        check_field(given <= most, name, f"must be at most {most}, not {given}")
 
 
 def parse_options(cls: type[T], query: str, source: str) -> T:

@@ -5,6 +5,7 @@ before it reads the values, and passes on whatever exception its parsers raise.
 """
 
 import contextlib
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -51,7 +52,7 @@ class NpzFile:
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         with self._member(name) as (stream, shape, fortran, dtype):
-            size = _count(shape) * dtype.itemsize
+            size = math.prod(shape) * dtype.itemsize
             info = self._members[name]
             if stream.tell() + size != info.file_size:
                 raise self._problem(name, f"is {dtype} {shape} by its header, but has {info.file_size} bytes")
@@ -115,6 +116,13 @@ class NpzFile:
         if wanted != found:
             odd = min(set(wanted) ^ set(found), default="").split()
             raise self._error(f"{self._path}: damaged: {odd[0] if odd else MANIFEST} is not what was saved")
+
+    def check(self) -> None:
+        """Read all arrays to their ends. Raises the file's error for one that differs from its checksum."""
+        for name in self.names:
+            with self._member(name) as (stream, *_):
+                while stream.read(_CHUNK):
+                    pass
 
     @contextmanager
     def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:
@@ -190,9 +198,10 @@ def read_npy(path: Path) -> NDArray[Any]:
             shape, fortran, dtype = _read_header(stream)
         except Exception as error:  # as above
             raise ValueError(said(error)) from error
-        if stream.tell() + _count(shape) * dtype.itemsize != size:
+        held = math.prod(shape) * dtype.itemsize
+        if stream.tell() + held != size:
             raise ValueError(f"it is {dtype} {shape} by its header, but has {size} bytes")
-        values = np.frombuffer(stream.read(), dtype) if _count(shape) * dtype.itemsize else np.empty(0, dtype)
+        values = np.frombuffer(stream.read(), dtype) if held else np.empty(0, dtype)
     return values.reshape(shape, order="F" if fortran else "C")
 
 
@@ -204,10 +213,3 @@ def _read_header(stream: Any) -> tuple[Shape, bool, np.dtype]:
     if dtype.hasobject or len(shape) > _MOST_DIMENSIONS or any(n < 0 for n in shape):
         raise ValueError(f"{dtype} {shape} is no array of plain values")
     return tuple(shape), fortran, dtype
-
-
-def _count(shape: Shape) -> int:
-    count = 1
-    for n in shape:
-        count *= n
-    return count

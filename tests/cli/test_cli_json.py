@@ -1,6 +1,7 @@
 """``--json``: the same facts for programs, and nothing else on stdout."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,19 @@ def test_the_backends() -> None:
     assert facts["backend"] == "cpu"
     assert set(facts["backends"]) == {"cpu", "vulkan", "cuda"}
     assert facts["compiler"] == f"{compiler.name()} {facts['versions'][compiler.name()]}"
+
+
+def test_info_reads_a_map_to_its_last_byte(tmp_path: Path) -> None:
+    said("map", SMALL, "--out", tmp_path, "--voxel-size", "0.2", "--no-pictures", "--runtime.arch", "cpu")
+    path = tmp_path / "map.npz"
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as file:
+        members = {member.filename: member for member in file.infolist()}
+    for name in ("belief.npy", "bricks.npy"):  # one that the facts need, and one that they do not
+        damaged = bytearray(whole)
+        begin = whole.index(name.encode()) + len(name)
+        damaged[begin + members[name].compress_size // 2] ^= 0x10
+        path.write_bytes(damaged)
+        done = taichi_mrf("info", path)
+        assert done.returncode == 2
+        assert name.removesuffix(".npy") in done.stderr

@@ -269,6 +269,8 @@ def test_options_and_defaults() -> None:
         ("room?frames=many", "frames must be of type int"),
         ("room?frames=", "frames must be of type int"),
         ("room?frames=0", "frames must be at least 1"),
+        ("room?frames=1000000000000", "frames must be at most 1000000, not 1000000000000"),
+        ("corridor?width=1000000", "width must be at most 10000, not 1000000"),
         ("room?width=-640", "width must be at least"),
         ("room?noise=some", "noise must be one of kinect, none"),
         ("room?frames", "name=value"),

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import imageio.v3
+import msgspec
 import numpy as np
 import pytest
 import viser
@@ -457,6 +458,20 @@ def test_decoding_either_reads_refuses_or_says_undecodable(encoded: bytes) -> No
     except Undecodable:
         return
     assert message is None or isinstance(message, Message)
+
+
+def test_a_message_of_deep_lists_is_refused_and_the_client_stays() -> None:
+    deep: list[Any] = []
+    for _ in range(600):
+        deep = [deep]
+    for message in (
+        {"type": "ViewerCameraMessage", "wxyz": deep},
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": deep}},
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": {"x": deep}}},
+    ):
+        assert decode(msgspec.msgpack.encode(message)) is None
+    plain = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": [[1.0]]}}
+    assert decode(msgspec.msgpack.encode(plain)) is not None
 
 
 def test_pictures_that_end_within_a_read_count_together() -> None:

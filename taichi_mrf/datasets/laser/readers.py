@@ -345,7 +345,7 @@ def holds_scans(path: Path) -> bool:
         return holds_ranges(path)
     try:
         with open_regular(path, DatasetError) as file:
-            head = file.read(_LOOKED_AT_BYTES)
+            head = file.read(_LOOKED_AT_BYTES) or b""  # None: a device without news
         if head[:2] == GZIP_MAGIC:
             head = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, _LOOKED_AT_BYTES)
     except (DatasetError, zlib.error, gzip.BadGzipFile):

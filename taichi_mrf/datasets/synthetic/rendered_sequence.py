@@ -101,7 +101,7 @@ class RenderOptions:
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
 
     def __post_init__(self) -> None:
-        require(self, frames=1, width=8, height=8, seed=0)
+        require(self, frames=(1, 1_000_000), width=(8, 10_000), height=(8, 10_000), seed=0)
 
     def camera(self) -> PinholeCamera:
         """The Kinect 1's field of view on this many pixels, which are square."""

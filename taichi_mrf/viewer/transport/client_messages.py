@@ -33,6 +33,9 @@ _KINDS: dict[Any, type[theirs.Message]] = {kind.__name__: kind for kind in _FIEL
 LARGEST_COORDINATE = 1e9
 """Metres; far beyond any map, and its square is still a finite float32."""
 
+DEEPEST = 6
+"""Levels of lists and dictionaries within each other; the page's own messages have three."""
+
 LONGEST_NAME = 1000
 """Characters of the name of a node or widget."""
 
@@ -56,7 +59,8 @@ def decode(encoded: bytes) -> theirs.Message | None:
     kind = _KINDS.get(name) if isinstance(name, str) else None
     if kind is None or not said.keys() <= set(_FIELDS[kind]):
         return None
-    if not _is_sane([value for field, value in said.items() if field != "updates"]):
+    plain = [value for field, value in said.items() if field != "updates"]
+    if not _is_shallow(said, DEEPEST) or not _is_sane(plain):
         return None
     try:
         return msgspec.convert(said, kind)
@@ -70,6 +74,12 @@ def encode(message: theirs.Message) -> bytes:
     return msgspec.msgpack.encode(
         {"type": kind.__name__, **{name: getattr(message, name) for name in _FIELDS[kind]}}
     )
+
+
+def _is_shallow(value: Any, levels: int) -> bool:
+    """True if lists and dictionaries lie within each other on so many levels at most."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return levels >= 0 and all(_is_shallow(each, levels - 1) for each in inside)
 
 
 def _is_sane(value: Any) -> bool:
