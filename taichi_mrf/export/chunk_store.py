@@ -240,8 +240,10 @@ def new_store(path: str | Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except MapFileError as error:
+        raise MapFileError(str(error).replace(str(temporary), str(path))) from error
     finally:
-        for folder in (temporary, old):
+        for folder in (temporary, old, temporary):  # again: a thread of zarr's may have been writing
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -36,6 +36,7 @@ def refused(write: Callable[[], object], folder: Path) -> None:
     with files_up_to(50), pytest.raises(MapFileError, match="cannot be written: ") as caught:
         write()
     assert str(folder) in str(caught.value)
+    assert ".part-" not in str(caught.value)  # the file that was asked for, not the one beside it
     assert "\n" not in str(caught.value)
     assert contents(folder) == before
 

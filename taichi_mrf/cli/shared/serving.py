@@ -18,10 +18,11 @@ def warn_of_host(host: str, port: int, what_they_can: str, print_line: PrintLine
     """Warn if ``host`` serves the page to other machines."""
     if host in LOOPBACK:
         return
+    here = port or "PORT"  # 0 is any
     print_line(
         f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
         f"{what_they_can}. It is safer to omit --host and to tunnel from where you watch: "
-        f"ssh -L {port}:127.0.0.1:{port} USER@THIS-MACHINE"
+        f"ssh -L {here}:127.0.0.1:{here} USER@THIS-MACHINE"
     )
 
 
