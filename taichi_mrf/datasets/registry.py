@@ -134,7 +134,7 @@ def format_name(source: str | Path) -> str:
     """The name of a source's format, for a source that can be opened."""
     path, _ = _path_and_query(str(source))
     if exists(path):
-        found = recognise(_only_inside(path) or path)
+        found = recognise(path) or recognise(_only_inside(path) or path)  # in this order, as it is opened
         return found.name if found is not None else "unknown"
     return str(source).partition("?")[0]
 

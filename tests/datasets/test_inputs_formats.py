@@ -25,6 +25,7 @@ from datasets_recordings import (
 from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.registry import format_name
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.session.source import open_source
@@ -42,6 +43,13 @@ def test_scannet_and_replica_need_no_note(tmp_path: Path, content: Content) -> N
     assert open_dataset(write_replica(tmp_path / "room0", content)).notes == []
     beside = write_replica(tmp_path / "room1" / "own", content, ".")
     check_frames(open_dataset(beside), content, 6553.5, colored=True)
+
+
+def test_a_folder_is_called_by_its_own_format_and_not_by_its_parts(tmp_path: Path, content: Content) -> None:
+    assert format_name(write_scannet(tmp_path / "scene0000_00", content)) == "ScanNet"
+    assert format_name(write_replica(tmp_path / "room0", content)) == "Replica (NICE-SLAM)"
+    write_replica(tmp_path / "around" / "room1", content)
+    assert format_name(tmp_path / "around") == "Replica (NICE-SLAM)"
 
 
 def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Content) -> None:
