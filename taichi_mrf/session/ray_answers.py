@@ -131,4 +131,6 @@ def _noise_at(
 ) -> tuple[float, float]:
     """Sigma and bias in metres of a pixel that measures a depth."""
     model = image.own.noise_model(m.noise, image.depth_m)
-    return model.table(image.camera).at_pixel(column, row, depth_m)
+    # For whole images, which is all that a noise model of another package answers for.
+    sigma, bias = model.table(image.camera).at_pixels(np.full(image.depth_m.shape, depth_m))
+    return float(sigma[row, column]), float(bias[row, column])

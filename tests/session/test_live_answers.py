@@ -2,15 +2,20 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import small_room
 from live_scene import CONFIG, FakeLink, finished, map_voxels, room, session_of, shown
+from plugged_noise import PixelNoise
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.session.ray_answers import pixel_answer
 from taichi_mrf.viewer.messages import Images, Notice, PixelRay, RayAnswer, RayThrough, Switch, Votes, Watch
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -37,6 +42,20 @@ def test_a_pixels_ray_has_its_measurement_along_the_ray() -> None:
     profile = m.ray_profile(frame.T_world_camera[:3, 3], towards)
     np.testing.assert_array_equal(answer.omega, profile.omega)
     assert abs(answer.distance[np.argmax(answer.omega)] - answer.measured_m) < 2 * m.voxel_size
+
+
+def test_a_click_is_answered_with_the_noise_of_another_package() -> None:
+    u, v = 15, 7
+    sigma_m = np.full((9, 20), 0.01, np.float32)
+    sigma_m[v, u] = 0.03
+    camera = PinholeCamera(20, 9, 10.0, 10.0, 9.5, 4.0)
+    image = StoredKeyframe(0, "one", np.full((9, 20), 2.0, np.float32), np.eye(4), camera, 0.0)
+    no_profile = SimpleNamespace(distance=0, length=0, occupancy=0, visibility=0, omega=0)
+    m: Any = SimpleNamespace(noise=PixelNoise(sigma_m), ray_profile=lambda *_: no_profile)
+    answer = pixel_answer(m, image, float(u), float(v))
+    slant = np.sqrt(1 + 0.55**2 + 0.3**2)
+    assert answer.measured_m == pytest.approx(2.0 * slant)
+    assert (answer.sigma_m, answer.bias_m) == (pytest.approx(0.03 * slant), 0.0)
 
 
 def test_a_ray_through_a_point_is_that_of_a_keyframe_that_sees_it() -> None:
