@@ -21,6 +21,7 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
 from taichi_mrf.doctor.remedy import remedy
@@ -122,8 +123,9 @@ def _learn_noise(
 
 
 def _refuse_what_is_read_wrong(task: MapTask, dataset: Dataset) -> None:
-    """Raise ReadWrongError for a recording whose frames explain each other in another reading only."""
-    if task.options.poses.follow or not doubtful_at_a_glance(dataset):
+    """Raise ReadWrongError for a recording whose frames explain each other in another reading only. Built-in
+    scenes are what they are."""
+    if is_rendered(task.source) or task.options.poses.follow or not doubtful_at_a_glance(dataset):
         return
     found = _mistakes(task, dataset)
     if found:
