@@ -36,6 +36,7 @@ from inputs_bags import (
 )
 from inputs_frames import moved
 from refusals import bad_frame, refused
+from rosbags.typesys import get_types_from_msg
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.images import decode_rvl
@@ -383,8 +384,16 @@ def only_color(bag: Bag) -> None:
     own_poses(bag)
 
 
+def livox(bag: Bag) -> None:
+    name = "livox_ros_driver2/msg/CustomMsg"
+    bag.types.register(get_types_from_msg("uint32 point_num", name))
+    bag.send("/livox/lidar", name, 1.0, point_num=0)
+    own_poses(bag)
+
+
 BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
     "no depth": ((only_color,), "", ("topics of depth images", "16UC1", "/camera/color/image_raw (rgb8)")),
+    "Livox": ((livox,), "", ("nor of point clouds", "/livox/lidar (CustomMsg)", "xfer_format 0")),
     "colour as depth": (
         (only_color,),
         "?depth=/camera/color/image_raw",

@@ -58,14 +58,18 @@ def no_depth(reader: RosReader) -> str:
     """Content of a bag without topics of depth images, and which of it might be read."""
     images = {topic.name: topic.encoding for topic in image_topics(reader)}
     held = [f"{t.name} ({images.get(t.name) or t.type.rpartition('/')[2]})" for t in reader.topics.values()]
-    text = (
-        f"contains no topics of depth images ({messages.ENCODINGS}); its topics: {', '.join(held) or 'none'}"
-    )
+    text = f"contains no topics of depth images ({messages.ENCODINGS}), nor of point clouds (PointCloud2)"
+    text += f"; its topics: {', '.join(held) or 'none'}"
     maybe = [name for name, encoding in images.items() if messages.may_be_depth(encoding)]
     if maybe:
         text += f". {' or '.join(f'?depth={name}' for name in maybe)} takes those images for depth"
     if any(topic.type == LASER_SCAN for topic in reader.topics.values()):
         text += ". LaserScans are not read from bags; taichi-mrf laser reads CARMEN logs and .npz"
+    if any(topic.type.endswith("/CustomMsg") for topic in reader.topics.values()):
+        text += (
+            ". CustomMsg is the Livox driver's own message: record with its xfer_format 0, which is "
+            "PointCloud2, or convert the bag (livox_to_pointcloud2)"
+        )
     return text
 
 
