@@ -342,11 +342,11 @@ def test_a_scale_that_few_use_is_found(room: list[Frame], steps: float, tmp_path
 
 
 def test_a_command_that_does_not_mend_a_recording_is_not_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    room: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = Diagnosis((Finding("poses are in centimetres", "--poses-are cm"),), before=0.2, after=0.001)
     monkeypatch.setattr("taichi_mrf.doctor.remedy.diagnose", lambda *each: wrong)
-    assert carry_out("doctor", write_numbered(tmp_path / "mine", rendered()[:4])) == 4
+    assert carry_out("doctor", write_numbered(tmp_path / "mine", room[:4])) == 4
     said = capsys.readouterr().out
     assert "--poses-are cm" not in said
     assert "none of the usual mistakes explains" in said

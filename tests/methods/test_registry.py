@@ -30,7 +30,7 @@ def test_nothing_outside_the_methods_asks_for_their_classes(repository: Path) ->
     # A picture of a ray is labelled "visibility", a mean of messages is one of log-odds, and so on.
     words = {
         "config/sections.py",
-        "config/values.py",
+        "config/gone.py",
         "inference/sweep.py",
         "viewer/scene/ray_plot.py",
         "voxels/layers.py",

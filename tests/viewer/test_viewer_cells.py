@@ -80,7 +80,7 @@ def test_a_cell_has_the_colour_of_its_own_probability() -> None:
     (color,) = set(boxes(store, look="voxels by probability").values())
     p = 2 / (1 + np.exp(0.5))
     scale = look_of(ViewOptions("voxels by probability"), store, (2, 1), VOXEL).scale
-    expected = scale.colors[round(255 * (p - 0.5) / 0.5)]
+    expected = scale.colors[round(255 * np.log(p / (1 - p)) / np.log(999))]
     assert np.abs(np.array(color, int) - expected).max() <= 3
 
 
