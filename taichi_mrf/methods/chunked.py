@@ -274,7 +274,7 @@ class ChunkedMap:
 
     def _read_by_rays(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
         """Log-odds of a chunk by the rule of the map, from the marginals'; NaN for unknown."""
-        if self._by == "marginal":
+        if self.holds_marginals:
             return block
         prior, min_evidence = self.header.prior_log_odds, self.header.min_evidence
         unknown = np.isnan(block)

@@ -173,7 +173,9 @@ class MapPart:
         first, after = self.lowest * BRICK, self.after * BRICK
         distances = self.source.distances(first - _MARGIN, after + _MARGIN)
         found = fused_surface(distances, self.voxel_size)
-        found = without_free(found, self.voxel_size, self.source.occupancy, LEAST * self.source.prior)
+        found = without_free(
+            found, self.voxel_size, self.source.marginals.occupancy, LEAST * self.source.prior
+        )
         found = within_voxels(found, self.voxel_size, first, after)
         return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
 

@@ -57,6 +57,10 @@ class FixedMap:
     probability: NDArray[np.float32]
     voxel_size: float = SIZE
 
+    @property
+    def marginals(self) -> "FixedMap":
+        return self
+
     def voxels(self, min_probability: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         keep = self.probability >= min_probability
         return self.centres[keep], self.probability[keep]

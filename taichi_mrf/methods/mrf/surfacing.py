@@ -67,9 +67,10 @@ def surface_field_of(
 def surface(
     m: VoxelMap, field: DistanceField, least: float, between: Callable[[], object] = lambda: None
 ) -> FusedSurface:
-    """The surface of a field, coloured if the map is, but for where no voxel of the map has the probability
+    """The surface of a field, coloured if the map is, but for where no voxel of the map has the marginal
     ``least``."""
-    found = without_free(fused_surface(field, m.voxel_size, between), m.voxel_size, m.occupancy, least)
+    found = fused_surface(field, m.voxel_size, between)
+    found = without_free(found, m.voxel_size, m.marginals.occupancy, least)
     return replace(found, colors=blended_colors(m, found.vertices_m) if m.has_colors else None)
 
 
