@@ -149,7 +149,7 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
     for mode, legend in [
-        ("probability", "probability"),
+        ("probability", "chance that a voxel is occupied"),
         ("uncertainty", "bits"),
         ("keyframes", "see the voxel"),
     ]:
