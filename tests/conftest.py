@@ -63,6 +63,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--quick"):
+        # Its first import on a machine lists the fonts by a process: within a test, --quick would skip that.
+        import matplotlib.figure  # noqa: F401
     tests_have_names = any("::" in argument for argument in config.args)
     if config.getoption("--queue") and not config.option.collectonly and not tests_have_names:
         config.stash[FILES] = []
