@@ -186,6 +186,9 @@ class Rules:
     lost_through: float = 0.05
     """That share after lost frames, and for loops: a wall fits by chance, but not what stood before it."""
 
+    relocated: int = 3
+    """Frames in a row that a lost camera's image has to fit near one place before it is there again."""
+
     long_lost: int = 10
     """Lost frames after which a camera's image has to fit without any doubt."""
 

@@ -172,15 +172,18 @@ class Intake:
         """The frame at the pose where it was taken."""
         assert self.tracker is not None
         assert self.result.track is not None
+        track, lost_before = self.result.track, self.tracker.lost
         with self.result.timed("tracking"):
             try:
                 found, tracked = self.tracker.follow(frame)
             except LostFrameError as error:
-                self.result.track.lost += 1
+                track.lost += 1
                 self._note_skipped(frame.name, str(error))
                 return Lost(str(error), self.tracker.lost)
+        if lost_before:
+            track.found_again[frame.name] = lost_before
         if self._remembers:
-            self.result.track.frames[index] = tracked
+            track.frames[index] = tracked
         return found
 
     def _added(self, frame: Frame) -> int:

@@ -6,9 +6,9 @@ Without colour, or where that fits nothing, there are two guesses: that the came
 moves on as it did. Both have turned as the gyroscope says, where there is one (turning.py); an accelerometer
 adds a third guess (momentum.py). If none fits, the scan of a sensor that sees around is searched for in all
 headings and metres around. A frame that fits nowhere is lost; the next one is searched around the last pose
-that was found, around the first, and around those of keyframes that look like it. Errors of alignment add up
-along the way, until a loop is closed (loops.py). Poses are kept relative to the keyframe of the moment, so
-that they follow when it is moved.
+that was found, around the first, and around those of keyframes that look like it. A place where a lost camera
+fits has to be confirmed by the frames that follow. Errors of alignment add up along the way, until a loop is
+closed (loops.py). Poses are kept relative to the keyframe of the moment, so that they follow if that moves.
 """
 
 import math
@@ -31,7 +31,7 @@ from taichi_mrf.config.schema import Config, KeyframeConfig, PoseConfig
 from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.errors import ConfigError, LostFrameError
-from taichi_mrf.geometry.poses import Pose, as_pose, inverse
+from taichi_mrf.geometry.poses import Pose, as_pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.momentum import Momentum
 from taichi_mrf.mapping.turning import GyroTurns, turned
@@ -68,10 +68,12 @@ class TrackedFrame:
 
 @dataclass
 class Track:
-    """The poses of a sequence's frames by dataset index, and how many frames were lost."""
+    """The poses of a sequence's frames by dataset index, and how many frames were lost. ``found_again`` has
+    each frame at which a lost camera was found, with the number of frames that were lost before it."""
 
     frames: dict[int, TrackedFrame] = field(default_factory=dict)
     lost: int = 0
+    found_again: dict[str, int] = field(default_factory=dict)
 
     @property
     def unsure(self) -> int:
@@ -123,6 +125,7 @@ class Tracker:
         self._before: TrackedFrame | None = None
         self._last: TrackedFrame | None = None
         self._lost = 0
+        self._again: list[Pose] = []
 
     @property
     def lost(self) -> int:
@@ -145,7 +148,7 @@ class Tracker:
         turn = self._turns.since(frame, self._last.stamp)
         guesses = turned(self._guesses(frame), self._pose(self._last), turn)
         if around is None and self._lost:
-            guesses += self._known_places(small_picture(depth_m, frame.color))
+            guesses += [*self._again[-1:], *self._known_places(small_picture(depth_m, frame.color))]
         config = self._config if turn is None or self._lost else self._gyro_config
         colors = partial(self._pictures.compared_with, frame, m.keyframes)
         located = self._from_flow(image, frame, config, colors)
@@ -154,6 +157,10 @@ class Tracker:
         T_world_camera, reason = located.T_world_camera, located.reason
         if T_world_camera is not None and around is None:
             reason = self._objection(located.overlap, self._locator.looked_through(image, T_world_camera))
+        if T_world_camera is None or reason:
+            self._again = []
+        elif around is None:
+            reason = self._unconfirmed(T_world_camera, located.overlap)
         if T_world_camera is None or reason:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {reason}")
@@ -167,7 +174,8 @@ class Tracker:
     def _objection(self, overlap: float, through: float) -> str:
         """Reason to doubt that a camera is where its image fits, with these shares near what is mapped and
         looking through it; empty if it is. The longer it was lost, the further it may be from there."""
-        least, most = 0.0, RULES.lost_through if self._lost else RULES.most_through
+        sure = not self._lost and overlap >= RULES.strict_overlap
+        least, most = 0.0, RULES.most_through if sure else RULES.lost_through
         if self._lost > RULES.long_lost:
             least, most = RULES.strict_overlap, RULES.strict_through
         if through > most:
@@ -176,6 +184,20 @@ class Tracker:
             near, needed = 100 * overlap, 100 * least
             return f"{near:.0f}% of its points lie near mapped surfaces, {needed:.0f}% are needed"
         return ""
+
+    def _unconfirmed(self, T_world_camera: Pose, overlap: float) -> str:
+        """Reason to wait before a lost camera is believed to be where its image fits; empty if the images
+        before it fitted near there as well, or if it was lost for a moment only and has hardly moved. All of
+        them are held against the map as it was when the camera was lost: an image that fits by chance, once
+        it is in the map, would explain those after it."""
+        assert self._last is not None
+        hardly = self._lost < RULES.relocated and overlap >= RULES.loop_overlap
+        if not self._lost or (hardly and _within_reach(self._pose(self._last), T_world_camera)):
+            return ""
+        near = self._again and _within_reach(self._again[-1], T_world_camera)
+        self._again = [*self._again, T_world_camera] if near else [T_world_camera]
+        missing = RULES.relocated - len(self._again)
+        return f"it fits a place that the frames after it have to confirm, {missing} more" if missing else ""
 
     def took(self, keyframe: int) -> TrackedFrame:
         """Note that the frame that was followed last has become this keyframe of the map, and may have been
@@ -208,6 +230,7 @@ class Tracker:
         T_world_camera = as_pose(T_world_camera)  # or rounding errors would add up over the frames
         tracked = self._tracked(frame.name, frame.stamp, T_world_camera, directions)
         self._before, self._last, self._lost, self._frame = self._last, tracked, 0, frame
+        self._again = []
         return replace(frame, T_world_camera=T_world_camera), tracked
 
     def _tracked(self, name: str, stamp: float, T_world_camera: Pose, directions: int) -> TrackedFrame:
@@ -287,6 +310,12 @@ class Tracker:
         best = sorted(known, key=lambda id: -likeness[id])[: RULES.known_places]
         first = [] if self._first is None else [self._pose(self._first)]
         return [*first, *(keyframes[id].T_world_camera for id in best)]
+
+
+def _within_reach(one: Pose, other: Pose) -> bool:
+    """True if a camera may go from the one pose (4, 4) to the other between two images."""
+    turned_rad, shifted_m = tangent_norms(one, other)
+    return turned_rad <= RULES.reach_rad and shifted_m <= RULES.reach_m
 
 
 def _ratio(ahead: float, observed: float) -> float:

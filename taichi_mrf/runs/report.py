@@ -61,6 +61,7 @@ def run_report(
         "notes": [
             *([] if dataset is None else dataset.notes),
             *_pose_notes(result, check is not None),
+            *_lost_notes(result.track),
             *_step_notes(result.steps),
         ],
     }
@@ -71,9 +72,24 @@ def rounded(seconds: dict[str, float]) -> dict[str, float]:
     return {stage: round(value, 3) for stage, value in seconds.items()}
 
 
-def _tracking(track: Track, loops_closed: int) -> dict[str, int]:
-    frames = len(track.frames)
-    return {"frames": frames, "lost": track.lost, "unsure": track.unsure, "loops_closed": loops_closed}
+def _tracking(track: Track, loops_closed: int) -> dict[str, Any]:
+    return {
+        "frames": len(track.frames),
+        "lost": track.lost,
+        "found_again": track.found_again,
+        "unsure": track.unsure,
+        "loops_closed": loops_closed,
+    }
+
+
+def _lost_notes(track: Track | None) -> list[str]:
+    if track is None or not track.lost:
+        return []
+    again = ", ".join(f"at {name} after {lost} lost frames" for name, lost in track.found_again.items())
+    return [
+        f"{track.lost} frames are not in the map, because the camera was lost. "
+        + (f"It was found again {again}." if again else "It was not found again.")
+    ]
 
 
 def unfinished_report(

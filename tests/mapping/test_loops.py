@@ -152,9 +152,9 @@ def test_a_camera_that_was_carried_away_is_found_where_it_had_been() -> None:
     shown = {i: nowhere() for i in (20, 21, 22)}
     result = map_sequence(walk(order, shown), replace(CONFIG, poses=PoseConfig(close_loops=False)))
     assert result.track is not None
-    assert list(result.skipped) == ["walk-020", "walk-021", "walk-022"]
+    assert list(result.skipped) == [f"walk-{i:03d}" for i in range(20, 25)]  # the last two confirm the place
     found = {i: T for i, T in result.track.poses(result.map).items() if i > 22}
-    assert list(found) == [23, 24, 25, 26]
+    assert list(found) == [25, 26]
     assert errors(found, order).max(axis=0)[1] < 0.06
 
 
