@@ -18,9 +18,23 @@ POSE_UNITS = {"mm": 1000.0, "cm": 100.0}
 """Units of positions other than metres, and how many are in a metre."""
 
 INVERSE, W_FIRST, LATE = "inverse", "wxyz", "late"
+SAME = {"arkit": "opengl", "blender": "opengl"}
+"""Other names of words."""
+
 _PLAIN = (INVERSE, W_FIRST, *AXES, *POSE_UNITS)
 WORDS = (*_PLAIN, f"{LATE}=SECONDS")
 AXIAL, RANGE = "axial", "range"
+
+TURNS = {
+    "turned-left": (1, False),
+    "turned-right": (3, False),
+    "upside-down": (2, False),
+    "mirrored": (0, True),
+    "turned-left,mirrored": (1, True),
+    "turned-right,mirrored": (3, True),
+    "upside-down,mirrored": (2, True),
+}
+"""How images may be stored: by how many quarters to the left, and whether they were mirrored before that."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +63,9 @@ class Conventions:
     along_ray: bool = False
     """Depth is the distance along the pixel's ray."""
 
+    turned: str = ""
+    """One of TURNS, by which images are turned; empty if they are as the sensor took them."""
+
     def __post_init__(self) -> None:
         if self.mounting and not any(self.mounting[3:]):
             raise ConfigError("--mounting takes x,y,z,qx,qy,qz,qw; its quaternion is zero")
@@ -56,7 +73,7 @@ class Conventions:
     @property
     def of_poses(self) -> bool:
         """True if any of them is of poses."""
-        return self != Conventions(along_ray=self.along_ray)
+        return self != Conventions(along_ray=self.along_ray, turned=self.turned)
 
     def flags(self) -> list[str]:
         """The flags that set these conventions, as they are typed."""
@@ -65,29 +82,55 @@ class Conventions:
         words += [f"{LATE}={self.late_s:g}"] if self.late_s else []
         flags = [f"--poses-are {','.join(words)}"] if words else []
         flags += [f"--mounting {','.join(f'{x:g}' for x in self.mounting)}"] if self.mounting else []
-        return flags + [f"--depth-is {RANGE}"] * self.along_ray
+        flags += [f"--depth-is {RANGE}"] * self.along_ray
+        return flags + [f"--image-is {self.turned}"] * bool(self.turned)
 
 
 AS_USUAL = Conventions()
 """The conventions of this package."""
 
 
-def conventions_of(poses_are: str | None, mounting: tuple[float, ...] | None, depth_is: str) -> Conventions:
+def conventions_of(
+    poses_are: str | None, mounting: tuple[float, ...] | None, depth_is: str, image_is: str | None = None
+) -> Conventions:
     """The conventions of these flags. Raises ConfigError, which names the flag and the nearest word."""
-    words = [word.strip().lower() for word in (poses_are or "").split(",") if word.strip()]
+    words = [SAME.get(word, word) for word in _words(poses_are)]
     late_s = 0.0
     for word in words:
         name, equals, value = word.partition("=")
         if equals and name == LATE:
             late_s = _seconds(value)
         elif word not in _PLAIN:
-            near = get_close_matches(word, _PLAIN, n=1)
-            meant = f"did you mean '{near[0]}'? " if near else ""
-            raise ConfigError(f"--poses-are: no such word '{word}'; {meant}It takes {', '.join(WORDS)}")
+            raise ConfigError(_no_word("--poses-are", word, (*_PLAIN, *SAME), WORDS))
     axes, unit = _only(words, AXES, "axes"), _only(words, tuple(POSE_UNITS), "units")
+    along_ray, turned = depth_is == RANGE, _turn(image_is)
     return Conventions(
-        W_FIRST in words, unit, INVERSE in words, axes, mounting or (), late_s, depth_is == RANGE
+        W_FIRST in words, unit, INVERSE in words, axes, mounting or (), late_s, along_ray, turned
     )
+
+
+def _words(text: str | None) -> list[str]:
+    return [word.strip().lower() for word in (text or "").split(",") if word.strip()]
+
+
+def _no_word(flag: str, word: str, known: tuple[str, ...], words: tuple[str, ...]) -> str:
+    near = get_close_matches(word, known, n=1)
+    meant = f"did you mean '{near[0]}'? " if near else ""
+    return f"{flag}: no such word '{word}'; {meant}It takes {', '.join(words)}"
+
+
+def _turn(image_is: str | None) -> str:
+    """The one of TURNS that is said, empty for none. Raises ConfigError."""
+    single = tuple(turn for turn in TURNS if "," not in turn)
+    words = set(_words(image_is))
+    for word in words.difference(single):
+        raise ConfigError(_no_word("--image-is", word, single, single))
+    if not words:
+        return ""
+    for turn in TURNS:
+        if words == set(turn.split(",")):
+            return turn
+    raise ConfigError(f"--image-is: {' and '.join(sorted(words - {'mirrored'}))} are both turns; name one")
 
 
 def _only(words: list[str], choice: tuple[str, ...], what: str) -> str:

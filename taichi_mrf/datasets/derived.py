@@ -1,9 +1,10 @@
 """Datasets that show the frames of another one in another way.
 
-Pixels are resampled: undistorted, thinned out, or both. Each output pixel is one recorded measurement: the
-one nearest to where its ray crosses the recorded image. Nothing is averaged. An average would mix the depths
-on both sides of an edge into surfaces that do not exist, and the mean or the minimum of several pixels has
-another noise than the sensor model assumes (the minimum of four is one sigma too near).
+Pixels are resampled: put back where images are turned, undistorted, thinned out. Each output pixel is one
+recorded measurement: the one nearest to where its ray crosses the recorded image. Nothing is averaged. An
+average would mix the depths on both sides of an edge into surfaces that do not exist, and the mean or the
+minimum of several pixels has another noise than the sensor model assumes (the minimum of four is one sigma
+too near).
 
 A recording is mended: its conventions are undone (conventions.py), and its origin is put near its first pose.
 This is done on frames, so that it is the same for all formats.
@@ -21,6 +22,7 @@ from taichi_mrf.datasets.base import Dataset, StatedSensor
 from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.datasets.turned import put_back, sensor_camera
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, LostFrameError, naming
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
@@ -128,12 +130,13 @@ class Resampled(Derived):
     """The frames of ``source``, each pixel of them picked from the recorded image.
 
     ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
-    did not meet the recorded image, which is no measurement. One in ``stride`` of them is kept; if they are
-    not ``distorted``, frames may have cameras of their own.
+    did not meet the recorded image, which is no measurement. Recorded images are ``turned`` (conventions.py).
+    One in ``stride`` pixels is kept; if they are not ``distorted``, frames may have cameras of their own.
     """
 
     rows: NDArray[np.int64] = field(kw_only=True)
     columns: NDArray[np.int64] = field(kw_only=True)
+    turned: str = field(kw_only=True)
     stride: int = field(kw_only=True)
     distorted: bool = field(kw_only=True)
 
@@ -166,21 +169,25 @@ class Resampled(Derived):
             return self.camera
         if self.distorted:
             raise FrameError(f"frame {frame.name}: has intrinsics of its own; --undistort needs --camera too")
-        return strided(pinhole(frame.camera, "--image-scale"), self.stride)[0]
+        recorded = pinhole(frame.camera, "--image-scale")
+        return strided(sensor_camera(recorded, self.turned), self.stride)[0]
 
 
-def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dataset:
-    """The dataset with its images undistorted and one in ``stride`` of their rows and columns kept.
+def resampled(dataset: Dataset, distortion: Sequence[float], stride: int, turned: str = "") -> Dataset:
+    """The dataset with its images put back where they are ``turned`` (conventions.py), undistorted, and one
+    in ``stride`` of their rows and columns kept.
 
     ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
     camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
     left of an image, and if its camera is no pinhole.
     """
     distorted = any(distortion)
-    if not distorted and stride == 1:
+    if not (distorted or turned) and stride == 1:
         return dataset
     with naming(dataset.name, ConfigError):
-        recorded = pinhole(dataset.camera, "--undistort" if distorted else "--image-scale")
+        flag = "--undistort" if distorted else "--image-is" if turned else "--image-scale"
+        stored = pinhole(dataset.camera, flag)
+    recorded = sensor_camera(stored, turned)
     with naming(f"{dataset.name}: image_scale 1/{stride} leaves no pixel", ConfigError):
         camera, first = strided(recorded, stride)
     rows, columns = np.meshgrid(
@@ -196,6 +203,10 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
             f"images undistorted with {', '.join(f'{k:g}' for k in distortion)}, "
             f"{share:.1%} of their pixels lie outside the recorded ones"
         )
+    if turned:
+        place = put_back(np.arange(stored.width * stored.height).reshape(stored.shape), turned)
+        outside, place = rows < 0, place[rows, columns]
+        rows, columns = (np.where(outside, -1, each) for each in np.divmod(place, stored.width))
     if stride > 1:
         notes.append(f"one in {stride} rows and columns is read: {camera.width} x {camera.height} pixels")
     return Resampled(
@@ -206,6 +217,7 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
         source=dataset,
         rows=rows,
         columns=columns,
+        turned=turned,
         stride=stride,
         distorted=distorted,
     )

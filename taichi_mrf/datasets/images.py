@@ -296,6 +296,7 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
     if camera is not None and (height, width) != camera.shape:
         raise DatasetError(
             f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
+            + ("; --image-is reads turned images" if (width, height) == camera.shape else "")
             + at_size(camera, width, height)
         )
     if width * height > MOST_PIXELS:

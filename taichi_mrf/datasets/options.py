@@ -61,6 +61,9 @@ class ReadOptions:
     depth_is: str = AXIAL
     """``axial``, or ``range`` for the distance along each pixel's ray."""
 
+    image_is: str | None = None
+    """How images are turned (conventions.py), such as ``turned-left``."""
+
     def __post_init__(self) -> None:
         try:
             self.conventions  # noqa: B018 (it checks its words)
@@ -93,7 +96,7 @@ class ReadOptions:
     @property
     def conventions(self) -> Conventions:
         """The conventions of poses and depths. Raises ConfigError."""
-        return conventions_of(self.poses_are, self.mounting, self.depth_is)
+        return conventions_of(self.poses_are, self.mounting, self.depth_is, self.image_is)
 
     @property
     def stride(self) -> int:

@@ -16,8 +16,16 @@ from taichi_mrf.datasets.base import Row, StatedSensor, Table
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
-from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
+from taichi_mrf.datasets.images import (
+    first_size,
+    look_at_depth,
+    note_of_largest,
+    read_color,
+    read_depth,
+    read_grey,
+)
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.turned import of_image_size
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -165,6 +173,10 @@ def recording(
     ``listed`` some have no row: a note says ``why_dropped``, unless the caller has said so."""
     dropped = 0 if listed is None else listed - len(rows)
     said = [f"{dropped} of {listed} images dropped: {why_dropped}"] if dropped and why_dropped else []
+    if turned := options.conventions.turned:
+        size = first_size(row.depth_file for row in rows)
+        camera = of_image_size(camera, size, turned)
+        rows = [replace(row, camera=row.camera and of_image_size(row.camera, size, turned)) for row in rows]
     return Recording(
         folder.name,
         camera,

@@ -24,6 +24,7 @@ from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.ros.names import is_bag
+from taichi_mrf.datasets.turned import T_sensor_stored, stored_camera
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
@@ -100,6 +101,7 @@ def open_dataset(
     poses_are: str | None = None,
     mounting: tuple[float, ...] | None = None,
     depth_is: str = AXIAL,
+    image_is: str | None = None,
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
@@ -108,7 +110,7 @@ def open_dataset(
     """
     options = ReadOptions(
         camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track,
-        poses_are, mounting, depth_is,
+        poses_are, mounting, depth_is, image_is,
     )  # fmt: skip
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
@@ -167,11 +169,16 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
         dataset.camera = PinholeCamera(recorded.width, recorded.height, *options.intrinsics)
     conventions = options.conventions
     dataset.tracked = dataset.tracked or options.track
+    given, turn = dataset.camera, T_sensor_stored(conventions.turned)
+    if conventions.turned:  # neighbouring frames are compared as they are stored
+        with naming(dataset.name, ConfigError):
+            dataset.camera = stored_camera(pinhole(given, "--image-is"), conventions.turned)
     dataset.notes += dataset.check_scale(
-        None if dataset.tracked else lambda index: pose_of(dataset.pose(index), conventions)
+        None if dataset.tracked else lambda index: pose_of(dataset.pose(index), conventions) @ turn
     )
+    dataset.camera = given
     distortion = dataset.distortion if options.undistort is None else options.undistort
-    picked = resampled(dataset, distortion, options.stride)
+    picked = resampled(dataset, distortion, options.stride, conventions.turned)
     picked.tracked = dataset.tracked
     asked = mended(picked, conventions, options.max_time_gap)
     apart = "" if asked.tracked or asked.endless else out_of_sight(asked)

@@ -41,6 +41,10 @@ class SourceFlags:
     depth_is: Literal["axial", "range"] = "axial"
     """Depth along the optical axis, or distance along each pixel's ray."""
 
+    image_is: str | None = None
+    """How images are stored, as 'taichi-mrf doctor' finds it, with poses of the sensor: turned-left,
+    turned-right or upside-down, and mirrored (left and right exchanged) with a comma between."""
+
     def words(self) -> list[str]:
         """The flags that differ from the defaults, as they are typed."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -61,8 +65,11 @@ class SourceFlags:
             "poses_are": self.poses_are,
             "mounting": _numbers("--mounting", self.mounting, (7,), "x,y,z,qx,qy,qz,qw"),
             "depth_is": self.depth_is,
+            "image_is": self.image_is,
         }
-        conventions_of(keywords["poses_are"], keywords["mounting"], keywords["depth_is"])
+        conventions_of(
+            keywords["poses_are"], keywords["mounting"], keywords["depth_is"], keywords["image_is"]
+        )
         return keywords
 
 

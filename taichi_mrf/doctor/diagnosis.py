@@ -8,7 +8,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, out_of_sight
-from taichi_mrf.datasets.derived import Derived, Mended
+from taichi_mrf.datasets.derived import Derived, Mended, Resampled
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
@@ -73,17 +73,21 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         )
     if isinstance(dataset, Mended):
         said = said if dataset.conventions == AS_USUAL else dataset.conventions
-        dataset = dataset.source
+        dataset = as_stored(dataset)
     elif isinstance(dataset, PosedFrames) and dataset.poses.conventions != AS_USUAL:
         inner = dataset.source
         said = dataset.poses.conventions
         if isinstance(inner, Mended):
-            said, inner = replace(said, along_ray=inner.conventions.along_ray), inner.source
+            undone = inner.conventions
+            said = replace(said, along_ray=undone.along_ray, turned=undone.turned)
+            inner = as_stored(inner)
         dataset = replace(dataset, source=inner, poses=dataset.poses.as_written(inner.frame_names))
-    given = Reading(**asdict(said))
     source: Dataset = dataset
     while isinstance(source, Derived):
+        if isinstance(source, Resampled) and source.turned:
+            said = replace(said, turned="")  # of the images that are compared
         source = source.source
+    given = Reading(**asdict(said))
     swapped = _swapped_images(source)
     if swapped is not None:
         return Diagnosis((swapped,), reading=given)
@@ -132,6 +136,15 @@ def doubtful_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> bool:
     return len(off) >= FEWEST_PAIRS and bool((off <= EXPLAINED).mean() < _MOST_EXPLAINED)
 
 
+def as_stored(dataset: Dataset) -> Dataset:
+    """A dataset without its conventions undone; turned images stay as they are put back if they are
+    undistorted too."""
+    if isinstance(dataset, PosedFrames):
+        return replace(dataset, source=as_stored(dataset.source))
+    inner = dataset.source if isinstance(dataset, Mended) else dataset
+    return inner.source if isinstance(inner, Resampled) and inner.turned and not inner.distorted else inner
+
+
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:
     """Differences of the best reading from the given one. Those of poses have the flag of them all."""
     poses = next((flag for flag in best.flags() if flag.startswith("--poses-are")), "--poses-are ''")
@@ -151,6 +164,11 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
     if best.along_ray != given.along_ray:
         along, word = ("ray", RANGE) if best.along_ray else ("optical axis", AXIAL)
         found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
+    if best.turned != given.turned:
+        words = best.turned.replace(",", " and ") or "as the sensor took them"
+        hands = "; or its poses are left-handed, and then the map is mirrored" if "mirrored" in words else ""
+        flag = best.turned or "''"
+        found.append(Finding(f"images are {words}{hands}", f"--image-is {flag}"))
     if best.factor != given.factor:
         right = steps / best.factor
         text = f"depth has {right:.6g} steps per metre ({_unit_of_depth(right)}), not {steps:.6g}"

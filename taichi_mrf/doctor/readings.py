@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from taichi_mrf.datasets.conventions import Conventions
+from taichi_mrf.datasets.turned import stored_camera
 from taichi_mrf.sensor.camera import PinholeCamera
 
 UNITS = {
@@ -57,10 +58,14 @@ class Reading(Conventions):
 
     def camera_of(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera that took the images."""
-        return _through(self.lens, recorded) if self.lens else recorded
+        return LENSES[self.lens](recorded) if self.lens else recorded
+
+    def stored_camera(self, recorded: PinholeCamera) -> PinholeCamera:
+        """The camera of the images as they are stored."""
+        return _stored(self, recorded) if self.lens or self.turned else recorded
 
 
 @cache
-def _through(lens: str, recorded: PinholeCamera) -> PinholeCamera:
-    """The camera for a key of LENSES: a search asks for few, and tens of thousands of times."""
-    return LENSES[lens](recorded)
+def _stored(reading: Reading, recorded: PinholeCamera) -> PinholeCamera:
+    """The camera of stored images: a search asks for few, and tens of thousands of times."""
+    return stored_camera(reading.camera_of(recorded), reading.turned)

@@ -9,8 +9,8 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AXIAL, conventions_of
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, unexplained
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.doctor.diagnosis import Diagnosis, as_stored, diagnose, unexplained
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 
 _ROUNDS = 3
 """How often what is read with the flags that were found is looked at for further ones."""
@@ -65,8 +65,9 @@ def remedy(source: str, poses: str | Path | None, reading: SourceFlags) -> Remed
 def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceFlags) -> Diagnosis:
     """Diagnosis of a source with the conventions of the flags not undone, so that they may be found wrong."""
     keywords = reading.keywords()
-    said = conventions_of(keywords["poses_are"], keywords["mounting"], keywords["depth_is"])
-    as_written = {**keywords, "poses_are": None, "mounting": None, "depth_is": AXIAL}
+    words = ("poses_are", "mounting", "depth_is", "image_is")
+    said = conventions_of(*(keywords[word] for word in words))
+    as_written = {**keywords, **dict.fromkeys(words), "depth_is": AXIAL}
     dataset: Dataset
     try:
         dataset = open_posed(source, poses, color=False, **as_written)
@@ -74,7 +75,14 @@ def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceF
         if as_written == keywords:
             raise
         dataset = open_posed(source, poses, color=False, **keywords)
-    return diagnose(dataset, said)
+    try:
+        return diagnose(dataset, said)
+    except FrameError as unread:  # such as images whose rows are the columns that the camera states
+        try:
+            turned = open_posed(source, poses, color=False, **{**as_written, "image_is": "turned-left"})
+            return diagnose(as_stored(turned), said)
+        except (DatasetError, ConfigError):
+            raise unread from None
 
 
 def _with_flags(reading: SourceFlags, flags: list[str]) -> SourceFlags:

@@ -2,6 +2,7 @@
 far away is moved, and frames agree on the steps per metre."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,12 @@ from every_format import EVERY
 from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.conventions import conventions_of
+from taichi_mrf.datasets.conventions import TURNS, conventions_of
+from taichi_mrf.datasets.derived import strided
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.datasets.turned import T_sensor_stored, put_back, sensor_camera, stored_camera
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, inverse, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -123,9 +126,52 @@ def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:
     assert np.allclose(axial.depth_m * slant, plain.depth_m, rtol=1e-6)
 
 
+@pytest.mark.parametrize("intrinsics", ["sensor", "stored"])
+@pytest.mark.parametrize("turned", TURNS)
+def test_turned_images_are_put_back(turned: str, intrinsics: str, tmp_path: Path) -> None:
+    """Also thinned out; intrinsics may be those of the images as they are stored."""
+    left, mirrored = TURNS[turned]
+    frames = list(open_dataset(write_room(tmp_path / "plain", 1000.0)))
+    folder = tmp_path / "turned"
+    for number, frame in enumerate(frames):
+        steps = np.rint(1000 * frame.depth_m).astype(np.uint16)
+        stored = np.rot90(steps[:, ::-1] if mirrored else steps, left)
+        write_image(folder / f"{number:04d}.png", np.ascontiguousarray(stored))
+    cx, cy = (WIDE.cy, WIDE.cx) if left % 2 and intrinsics == "stored" else (WIDE.cx, WIDE.cy)
+    (folder / "K.txt").write_text(f"70 0 {cx}\n0 70 {cy}\n0 0 1\n")
+    write_rows(folder / "poses.txt", [frame.T_world_camera for frame in frames])
+    dataset = open_dataset(folder, image_is=turned)
+    assert dataset.camera == WIDE
+    assert any(note.startswith("depth: 1000 steps per metre, found") for note in dataset.notes)
+    assert f"conventions: --image-is {turned}" in dataset.notes
+    read, thin = dataset.read(7), open_dataset(folder, image_is=turned, image_scale=0.5).read(7)
+    np.testing.assert_array_equal(read.depth_m, frames[7].depth_m)
+    assert (read.camera, thin.camera) == (WIDE, strided(WIDE, 2)[0])
+    np.testing.assert_array_equal(thin.depth_m, frames[7].depth_m[::2, ::2])
+
+
+@pytest.mark.parametrize("turned", TURNS)
+def test_the_camera_of_a_stored_image_sees_what_it_shows(turned: str) -> None:
+    """A point of the sensor's frame, in that of the stored image, is seen where its pixel has gone."""
+    left, mirrored = TURNS[turned]
+    sensor = PinholeCamera(80, 60, 70.0, 72.0, 41.0, 28.0)
+    marked = np.zeros(sensor.shape)
+    marked[11, 23] = 1
+    stored = np.rot90(marked[:, ::-1] if mirrored else marked, left)
+    camera = stored_camera(replace(sensor, width=stored.shape[1], height=stored.shape[0]), turned)
+    point = T_sensor_stored(turned)[:3, :3].T @ (2.0 * sensor.directions(23, 11))
+    u, v, depth_m = camera.project(point[None])[0]
+    assert stored[round(v), round(u)] == 1
+    np.testing.assert_allclose([u, v, depth_m], [round(u), round(v), 2.0])
+    assert sensor_camera(camera, turned) == sensor or not left % 2
+    np.testing.assert_array_equal(put_back(stored, turned), marked)
+
+
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
+        ({"image_is": "turned-lft"}, "--image-is: no such word 'turned-lft'; did you mean 'turned-left'"),
+        ({"image_is": "turned-left,upside-down"}, "turned-left and upside-down are both turns"),
         ({"poses_are": "invers"}, "no such word 'invers'; did you mean 'inverse'"),
         ({"poses_are": "opengl,ros"}, "opengl and ros are both axes"),
         ({"poses_are": "mm,cm"}, "mm and cm are both units"),
@@ -141,8 +187,11 @@ def test_wrong_words_are_named(flags: dict[str, str], text: str) -> None:
 
 def test_flags_say_their_conventions() -> None:
     given = ("--poses-are wxyz,inverse,ros,late=0.5", "--mounting 1,2,3,0,0,0,1", "--depth-is range")
-    found = conventions_of("ros,late=0.5,inverse,wxyz", (1, 2, 3, 0, 0, 0, 1), "range")
-    assert tuple(found.flags()) == given
+    found = conventions_of(
+        "ros,late=0.5,inverse,wxyz", (1, 2, 3, 0, 0, 0, 1), "range", "mirrored,turned-left"
+    )
+    assert tuple(found.flags()) == (*given, "--image-is turned-left,mirrored")
+    assert conventions_of("blender,arkit", None, "axial").axes == "opengl"
 
 
 WIDE = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)

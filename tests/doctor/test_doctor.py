@@ -23,6 +23,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.doctor.diagnosis import Diagnosis, Finding, diagnose, doubtful_at_a_glance, mistakes
 from taichi_mrf.doctor.picture import overlap
+from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import DatasetError, ReadWrongError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.frame import Frame
@@ -93,6 +94,10 @@ def test_the_mistake_in_a_broken_kitchen_is_named(shared_data: Path, name: str) 
     [
         (("opengl", "inverse"), {"--poses-are inverse,opengl"}),
         (("ros", "wxyz"), {"--poses-are wxyz,ros"}),
+        (
+            ("turned-left", "opengl", "unit"),
+            {"--poses-are opengl", "--depth-scale 1000", "--image-is turned-left"},
+        ),
         (("inverse", "range", "unit"), {"--poses-are inverse", "--depth-scale 1000", "--depth-is range"}),
     ],
 )
@@ -152,6 +157,23 @@ def test_poses_that_cannot_be_are_named(room: list[Frame]) -> None:
         "--poses-are mm",
         "--depth-scale 1000",
     ]
+
+
+@pytest.mark.parametrize("states_size", [False, True])
+def test_turned_images_are_found_and_read(room: list[Frame], states_size: bool, tmp_path: Path) -> None:
+    """With a camera file of the sensor's size no image fits it."""
+    folder, k = write_numbered(tmp_path / "mine", broken(room, "turned-left")), room[0].camera
+    if states_size:
+        (folder / "K.txt").unlink()
+        (folder / "camera.txt").write_text(f"{k.width} {k.height} {k.fx} {k.fy} {k.cx} {k.cy}")
+    found = remedy(str(folder), None, SourceFlags())
+    assert f"map {folder} --image-is turned-left" in found.command
+    wrong = remedy(str(folder), None, SourceFlags(image_is="turned-right", depth_scale=1000))
+    assert f"map {folder} --depth-scale=1000.0 --image-is turned-left" in wrong.command
+    read = open_dataset(folder, image_is="turned-left", depth_scale=1000, color=False)
+    assert diagnose(read).findings == ()
+    assert read.read(3).camera == k
+    np.testing.assert_allclose(read.read(3).depth_m, room[3].depth_m, atol=6e-4)
 
 
 def test_a_sensor_that_moves_farther_than_it_sees_is_a_note(room: list[Frame], tmp_path: Path) -> None:

@@ -21,6 +21,9 @@ FLAGS = {
     "range": "--depth-is range",
     "late": "--poses-are late=",
     "intrinsics": "--camera ",
+    "turned-left": "--image-is turned-left",
+    "upside-down": "--image-is upside-down",
+    "turned-right,mirrored": "--image-is turned-right,mirrored",
 }
 """Flags that mend them, or how these begin."""
 
@@ -73,6 +76,21 @@ def of_camera(factor: float) -> Break:
     return lambda frames: [change(f) for f in frames]
 
 
+def turned(name: str) -> Break:
+    """Images of which nobody says that they are turned; poses and intrinsics are the sensor's."""
+    left, mirrored = {"turned-left": (1, False), "upside-down": (2, False)}.get(name, (3, True))
+
+    def change(frame: Frame) -> Frame:
+        depth_m = np.rot90(frame.depth_m[:, ::-1] if mirrored else frame.depth_m, left).copy()
+        return replace(
+            frame,
+            depth_m=depth_m,
+            camera=replace(frame.camera, width=depth_m.shape[1], height=depth_m.shape[0]),
+        )
+
+    return lambda frames: [change(f) for f in frames]
+
+
 LATE_S = 0.3
 BREAKS: dict[str, Break] = {
     "inverse": of_poses(inverse),
@@ -83,6 +101,7 @@ BREAKS: dict[str, Break] = {
     "range": of_depth(lambda f: f.depth_m * np.linalg.norm(f.camera.rays(), axis=-1)),
     "late": late(LATE_S),
     "intrinsics": of_camera(2.0),
+    **{name: turned(name) for name in ("turned-left", "upside-down", "turned-right,mirrored")},
 }
 
 
