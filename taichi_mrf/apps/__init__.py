@@ -2,4 +2,7 @@
 
 from pathlib import Path
 
-__path__.append(str(Path(__file__).resolve().parents[2] / "apps"))
+_HERE = Path(__file__).resolve().parent
+
+if not (_HERE / "batch.py").is_file():
+    __path__.append(str(_HERE.parents[1] / "apps"))
