@@ -91,7 +91,9 @@ def map_to_folder(
         learnt = learnt_from(task, dataset, settings, progress, request)
         if learnt is not None:
             settings = learnt.put_into(settings)
-        seconds["learning noise"] = time.perf_counter() - start
+        took = time.perf_counter() - start
+        if took > 0.05:  # most recordings are not looked at
+            seconds["learning noise"] = took
         facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned, learnt)
 
         # The map: an empty one, or that of a run which was stopped.
@@ -112,8 +114,6 @@ def map_to_folder(
         run.settle()  # align all with each other if poses are refined, then infer the marginals
 
         # The folder: the map, its check against frames that were held out, pictures, the report.
-        if seconds["learning noise"] < 0.05:  # most recordings are not looked at
-            del seconds["learning noise"]
         run.result.seconds = {**seconds, **run.result.seconds}
         return write_run(
             task.out,
