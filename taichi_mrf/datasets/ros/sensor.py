@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
+from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
@@ -48,21 +48,16 @@ class BagSensor:
 def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) -> BagSensor:
     """The messages of a topic that are read. Raises DatasetError, naming file and topic, if there is none, or
     no run that the user wants, or if they are of several frames and of none that the user named."""
-    recorded = [entry for entry, _ in reader.messages(topic)]
+    recorded, said = stamped(reader, topic, what)
     if not recorded:  # in a damaged file, whose index counts some
         raise DatasetError(f"{reader.path}: topic {topic} contains no message")
     frames = Counter(entry.frame for entry in recorded)
-    notes = []
+    notes = list(said)
     if choice.optical and len(frames) > 1:
         if choice.optical not in frames:
             raise DatasetError(f"{_several(reader, topic, what, frames)}: ?optical= names none of these")
         recorded = [entry for entry in recorded if entry.frame == choice.optical]
         notes.append(f"of {topic} the {len(recorded)} {what} of {choice.optical} are read")
-    if len(recorded) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in recorded}) < len(recorded):
-        recorded = [replace(entry, stamp=entry.recorded_ns / 1e9) for entry in recorded]
-        notes.append(f"the stamps of {topic} stand still: the times of recording are taken")
-    elif recorded[0].stamp == recorded[0].recorded_ns / 1e9 and _is_unstamped(reader.first(topic)):
-        notes.append(f"the stamps of {topic} are 0: the times of recording are taken, which are later")
     run, entries, said = run_of(reader, topic, recorded, choice.run, what)
     frame = choice.optical or entries[0].frame
     return BagSensor(
@@ -75,10 +70,6 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
         cache(lambda: _tree(reader, topic, frame, choice.tf, run)),
         notes + said,
     )
-
-
-def _is_unstamped(message: Any) -> bool:
-    return header_ns(message.header) == 0
 
 
 def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
