@@ -264,6 +264,7 @@ ORIGIN_STEP_M = 1000.0
 T_AXES_OPTICAL: dict[str, NDArray[np.float64]] = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "ned": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 """The rotations that take optical axes to others."""
 

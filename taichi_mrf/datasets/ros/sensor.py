@@ -217,7 +217,9 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
             f"{reader.path}: topic {name}: the cameras of {', '.join(frames)} have different lenses; "
             "?optical=FRAME takes one's images only"
         )
-    cameras = BagCameras(by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame))
+    cameras = BagCameras(
+        by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame, entries)
+    )
     return _fitted(reader, depth, name, entries, cameras)
 
 
@@ -236,10 +238,20 @@ def _frame_of_info(
     )
 
 
-def _changes(by_frame: Mapping[str, Sequence[object]]) -> list[str]:
-    count = max((len(cameras) for cameras in by_frame.values()), default=1)
-    times = "once" if count == 2 else f"{count - 1} times"
-    return [f"the camera changes {times}, by its CameraInfo"] if count > 1 else []
+def _changes(
+    by_frame: Mapping[str, Sequence[tuple[float, StatedCamera]]], entries: Sequence[Entry]
+) -> list[str]:
+    """A note of cameras that change, with the number of the first image of another one."""
+    frame, stated = max(by_frame.items(), key=lambda each: len(each[1]))
+    if len(stated) == 1:
+        return []
+    times = "once" if len(stated) == 2 else f"{len(stated) - 1} times"
+    (_, old), (since, new) = stated[:2]
+    first = next((i for i, e in enumerate(entries) if e.stamp >= since and e.frame == frame), None)
+    which = f"from frame {first:06d} on " if first is not None else ""
+    return [
+        f"the camera changes {times}, by its CameraInfo: {which}fx is {new.full.fx:g}, before {old.full.fx:g}"
+    ]
 
 
 def _half_a_frame(entries: Sequence[Entry]) -> float:
@@ -297,6 +309,12 @@ def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ..
     if matrix[0, 0] <= 1:
         raise DatasetError(
             f"is not calibrated (a focal length of {matrix[0, 0]:g} pixels); pass --camera fx,fy,cx,cy"
+        )
+    if not (info.width and info.height):
+        k = ",".join(f"{matrix[i, j]:g}" for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        raise DatasetError(
+            f"says that images have {info.width} x {info.height} pixels, so nothing tells whether its "
+            f"intrinsics are theirs; --camera {k} takes them"
         )
     try:
         full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
