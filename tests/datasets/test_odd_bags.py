@@ -364,6 +364,18 @@ def test_stamps_that_are_right_stay_and_wrong_ones_are_found(
     np.testing.assert_allclose(found, stamps, atol=1e-6)
 
 
+@pytest.mark.parametrize("poses", [odometry, moving_tf])
+def test_late_poses_are_interpolated_in_their_own_times(make: Make, poses: Callable[..., None]) -> None:
+    """The body goes a way that bends between two images; its poses are stamped .05 s late."""
+
+    def dense(bag: Bag) -> None:
+        poses(bag, late=0.05, numbers=np.arange(-1, COUNT, 0.1).tolist())
+
+    dataset = open_dataset(make(images, dense, mounted, kind="mcap"), poses_are="late=0.05")
+    check_poses(dataset, atol=ROUNDED)
+    assert not any("poses of frames alone" in note for note in dataset.notes)
+
+
 def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Make) -> None:
     def once(bag: Bag) -> None:
         bag.tf("/tf", stamp(2), "map", "odom", np.eye(4))

@@ -151,6 +151,17 @@ def test_a_lens_that_zooms_is_as_it_should_be(room: list[Frame]) -> None:
     assert diagnose(of_frames(frames)).findings == ()
 
 
+def test_one_image_of_another_size_is_named_before_map_stops_at_it(
+    room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_numbered(tmp_path / "mine", room)
+    write_image(folder / "depth/0010.png", np.full((60, 80), 1000, np.uint16))
+    assert carry_out("info", folder) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert "0010.png" in said
+    assert "80 x 60 pixels, the camera 160 x 120" in said
+
+
 def test_swapped_bytes_of_depth_are_named(
     room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import Track
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
@@ -124,6 +125,19 @@ def posed_by(
     )
     notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes), *dropped]
     return [(i, entries[i], pose) for i, pose in posed], notes
+
+
+def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[], Track] | None:
+    """Reads the poses of a topic's only sensor in their own times; None if there are none of these."""
+    poses = next(iter(found.values()))
+    if len(found) > 1 or not len(poses.stamps):
+        return None
+
+    def read() -> Track:
+        known = [(stamp, poses.at(stamp, largest_gap(options))) for stamp in poses.stamps]
+        return [stamp for stamp, T in known if T is not None], [T for _, T in known if T is not None]
+
+    return read
 
 
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
