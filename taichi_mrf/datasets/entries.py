@@ -138,6 +138,14 @@ FORMATS: tuple[Format, ...] = (
         reader("formats.replica:open_folder"),
     ),
     Format(
+        "nerfstudio",
+        "transforms.json with depth_file_path",
+        lambda path: (
+            _has("transforms.json")(path) and resolve_name(f"{HERE}.formats.nerfstudio:recognises")(path)
+        ),
+        reader("formats.nerfstudio:open_folder"),
+    ),
+    Format(
         "ICL-NUIM / Redwood",
         NUMBERED_FILES,
         lambda path: bool(numbered_images(path)),

@@ -226,8 +226,9 @@ def unread_poses(folder: Path) -> str:
     """Problem of a text file whose name says that it holds poses, in words."""
     if is_file(folder / "transforms.json"):
         return (
-            ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "
-            "into poses.txt, and pass --poses-are opengl and --camera fl_x,fl_y,cx,cy"
+            ". transforms.json, as nerfstudio has it, is read if its frames have a depth_file_path; else "
+            "write its transform_matrix, row by row, into poses.txt, and pass --poses-are opengl and "
+            "--camera fl_x,fl_y,cx,cy"
         )
     for path in sorted([*folder.glob("*.txt"), *folder.glob("*.csv")]):
         if re.search("pose|traj|groundtruth", path.name, re.IGNORECASE):

@@ -5,7 +5,7 @@ A format only lists the files of each frame; a frame is checked here, when it is
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import cv2
@@ -29,6 +29,7 @@ from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.files import is_file
 
 ASKED = "--depth-scale"
 """Origin of a scale that the caller gives."""
@@ -198,6 +199,19 @@ def recording(
 def first_file(candidates: Iterable[Path]) -> Path | None:
     """The first of some files that is there."""
     return next((path for path in candidates if path.is_file()), None)
+
+
+def beside(folder: Path, name: str) -> Path:
+    """A file that a list in a folder names; with a path of another computer that with the same end, if it is
+    there."""
+    path = folder / name
+    try:
+        parts = PureWindowsPath(name).parts
+        if len(parts) < 2 or is_file(path):
+            return path
+        return first_file(folder.joinpath(*parts[first:]) for first in (0, -2)) or path
+    except OSError:  # a name that is too long
+        return path
 
 
 def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:

@@ -174,7 +174,7 @@ class Tracker:
     def _objection(self, overlap: float, through: float) -> str:
         """Reason to doubt that a camera is where its image fits, with these shares near what is mapped and
         looking through it; empty if it is. The longer it was lost, the further it may be from there."""
-        sure = not self._lost and overlap >= RULES.strict_overlap
+        sure = not self._lost and overlap >= RULES.loop_overlap
         least, most = 0.0, RULES.most_through if sure else RULES.lost_through
         if self._lost > RULES.long_lost:
             least, most = RULES.strict_overlap, RULES.strict_through

@@ -79,8 +79,9 @@ def noise_notes(
     elif check is not None and check.factor > HIDDEN and check.gain > LEAST_HIDDEN_GAIN:
         notes.append(
             f"The measured depths of {check.frames} held-out frames are likeliest with "
-            f"{check.factor:.2g} times what {_noise_name(sensor)} allows, but by {check.gain:.3f} nats each only: voxels are so large "
-            "that they hide the noise, and the map hardly depends on it. Smaller voxels tell more."
+            f"{check.factor:.2g} times what {_noise_name(sensor)} allows, but by {check.gain:.3f} nats each "
+            "only: voxels are so large that they hide the noise, and the map hardly depends on it. Smaller "
+            "voxels tell more."
         )
     return notes
 

@@ -215,6 +215,37 @@ def write_replica(folder: Path, content: Content, place: str = "..") -> Path:
     return folder
 
 
+def write_nerfstudio(folder: Path, content: Content, **changes: object) -> Path:
+    """Nerfstudio's layout: colour has twice the pixels of depth along each side. ``changes`` replace entries
+    of transforms.json, and None leaves them out."""
+    height, width = content.size
+    frames = []
+    for i in range(content.count):
+        write_image(folder / f"depth/frame_{i + 1:05d}.png", content.depth[i])
+        color = np.repeat(np.repeat(content.color[i], 2, axis=0), 2, axis=1)
+        write_image(folder / f"images/frame_{i + 1:05d}.png", color)
+        frames.append(
+            {
+                "file_path": f"images/frame_{i + 1:05d}.png",
+                "depth_file_path": f"depth/frame_{i + 1:05d}.png",
+                "transform_matrix": (content.poses[i] @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+            }
+        )
+    values = {
+        "camera_model": "OPENCV",
+        "w": 2 * width,
+        "h": 2 * height,
+        "fl_x": 28.0,
+        "fl_y": 30.0,
+        "cx": 2 * 7.5 + 0.5,
+        "cy": 2 * 5.5 + 0.5,
+        "frames": frames,
+    }
+    values = {name: value for name, value in (values | changes).items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(values))
+    return folder
+
+
 def column_by_column(matrix: np.ndarray) -> list[float]:
     return [float(x) for x in matrix.T.reshape(-1)]
 
@@ -279,6 +310,7 @@ FORMATS = {
     "house": Format(write_house, 5000.0, False, 180.0, 1.0),  # nobody knows when: a second apart
     "scannet": Format(write_scannet, 1000.0, False, 0.0, 5 / 30),
     "replica": Format(write_replica, 6553.5, True, 0.0, 1 / 30),
+    "nerfstudio": Format(write_nerfstudio, 1000.0, True, 0.0, 1.0),
 }
 
 

@@ -12,7 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from taichi_mrf.datasets.base import Dataset, Track
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, recording
+from taichi_mrf.datasets.recording import RecordedFrame, beside, recording
 from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
@@ -167,7 +167,7 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         if not entries and re.match(r"\W*(time|stamp)", words[0], re.IGNORECASE):
             continue  # names of columns
         try:
-            stamp, file = float(words[0]), _beside(path.parent, words[1].strip(" \t\"'"))
+            stamp, file = float(words[0]), beside(path.parent, words[1].strip(" \t\"'"))
         except (ValueError, IndexError):
             raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
         if not math.isfinite(stamp):
@@ -180,17 +180,3 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         raise DatasetError(f"{path}: lists no image")
     rate = stamps_a_second([stamp for stamp, _ in entries])
     return sorted((stamp / rate, file) for stamp, file in entries)
-
-
-def _beside(folder: Path, name: str) -> Path:
-    """A listed file; with a path of another computer that with the same last folder and name, if it is
-    there."""
-    path = folder / name
-    try:
-        parts = PureWindowsPath(name).parts
-        if len(parts) < 2 or is_file(path):
-            return path
-        moved = folder.joinpath(*parts[-2:])
-        return moved if is_file(moved) else path
-    except OSError:  # a name that is too long
-        return path
