@@ -15,7 +15,7 @@ NO_NOISE = 8.0
 """No sensor's noise differs from a stated one by so large a factor: what is wrong is something else."""
 
 HIDDEN, LEAST_HIDDEN_GAIN = 3.0, 0.005
-"""A larger factor is told where it gains few nats, too; right noises gain .004 at most."""
+"""A larger factor is told where it gains few nats a pixel, too, from so many on."""
 
 
 def noise_report(
