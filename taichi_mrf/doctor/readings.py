@@ -55,12 +55,31 @@ class Reading(Conventions):
     lens: str = ""
     """A key of LENSES; empty if the intrinsics are right."""
 
+    focal: float = 1.0
+    """Factor by which focal lengths must be multiplied."""
+
+    camera: PinholeCamera | None = None
+    """The camera of all images of its size, where intrinsics change that should not; None for each one's."""
+
     def camera_of(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera that took the images."""
-        return _through(self.lens, recorded) if self.lens else recorded
+        if self.camera is not None and self.camera.shape == recorded.shape:
+            recorded = self.camera
+        return _through(self.lens, self.focal, recorded) if self.lens or self.focal != 1.0 else recorded
+
+    @property
+    def of_camera(self) -> "Reading":
+        """What of it is of the camera alone."""
+        return Reading(along_ray=self.along_ray, lens=self.lens, focal=self.focal, camera=self.camera)
+
+    @property
+    def of_poses_alone(self) -> "Reading":
+        """What of it is of poses, at their own times."""
+        return replace(self, late_s=0.0, along_ray=False, factor=1.0, lens="", focal=1.0, camera=None)
 
 
 @cache
-def _through(lens: str, recorded: PinholeCamera) -> PinholeCamera:
+def _through(lens: str, focal: float, recorded: PinholeCamera) -> PinholeCamera:
     """The camera for a key of LENSES: a search asks for few, and tens of thousands of times."""
-    return LENSES[lens](recorded)
+    camera = LENSES[lens](recorded) if lens else recorded
+    return replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)

@@ -21,6 +21,7 @@ FLAGS = {
     "range": "--depth-is range",
     "late": "--poses-are late=",
     "intrinsics": "--camera ",
+    "ned": "--poses-are ned",
 }
 """Flags that mend them, or how these begin."""
 
@@ -39,6 +40,11 @@ def opengl(T: np.ndarray) -> np.ndarray:
 def body(T: np.ndarray) -> np.ndarray:
     """The pose of a body whose x is the camera's z, whose y is its -x, and whose z is its -y."""
     return np.column_stack([T[:, 2], -T[:, 0], -T[:, 1], T[:, 3]])
+
+
+def ned(T: np.ndarray) -> np.ndarray:
+    """The pose of a body whose x is the camera's z, whose y is its x, and whose z is its y."""
+    return T[:, [2, 0, 1, 3]]
 
 
 def w_first(T: np.ndarray) -> np.ndarray:
@@ -73,6 +79,13 @@ def of_camera(factor: float) -> Break:
     return lambda frames: [change(f) for f in frames]
 
 
+def of_focal(factor: float) -> Break:
+    """Intrinsics whose focal lengths are off by a factor."""
+    return lambda frames: [
+        replace(f, camera=replace(f.camera, fx=f.camera.fx * factor, fy=f.camera.fy * factor)) for f in frames
+    ]
+
+
 LATE_S = 0.3
 BREAKS: dict[str, Break] = {
     "inverse": of_poses(inverse),
@@ -83,6 +96,7 @@ BREAKS: dict[str, Break] = {
     "range": of_depth(lambda f: f.depth_m * np.linalg.norm(f.camera.rays(), axis=-1)),
     "late": late(LATE_S),
     "intrinsics": of_camera(2.0),
+    "ned": of_poses(ned),
 }
 
 
