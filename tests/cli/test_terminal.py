@@ -51,7 +51,8 @@ def test_only_one_module_opens_the_terminal() -> None:
     assert not [
         path
         for path in folder.rglob("*.py")
-        if path.name not in ("terminal.py", "start.py") and re.search(r"\bConsole\(|file=sys\.stderr", path.read_text())
+        if path.name not in ("terminal.py", "start.py")
+        and re.search(r"\bConsole\(|file=sys\.stderr", path.read_text())
     ]
 
 
