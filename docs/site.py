@@ -63,7 +63,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     markdown = re.sub(r"\]\((?:\.\./)?configs/default\.yaml\)", "](parameters.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/([^)]+)\)", r"](\1)", markdown)
-    elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf|tests|Makefile)/?)[^)]*"
+    elsewhere = r"(?:LICENSE|(?:apps|examples|configs|taichi_mrf|tests|Makefile)/?)[^)]*"
     return re.sub(rf"\[([^\]]+)\]\((?:\.\./)?{elsewhere}\)", r"\1", markdown)
 
 

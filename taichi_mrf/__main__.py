@@ -2,7 +2,7 @@
 
 import sys
 
-from taichi_mrf.cli.main import main
+from taichi_mrf.cli.start import start
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

@@ -14,6 +14,7 @@ import taichi_mrf
 
 PACKAGE = Path(taichi_mrf.__file__).parent
 FLOORS = yaml.safe_load((PACKAGE.parent / "docs" / "floors.yaml").read_text(encoding="utf-8"))
+APPS = PACKAGE.parent / "apps"
 MOST_LOADED = 12_320
 """Lines of this package that MRFMap may load before a map is made."""
 
@@ -22,11 +23,12 @@ OPEN_TO_ALL = {"errors", ""}
 
 @cache
 def modules() -> dict[str, Path]:
-    """Every module's dotted name below the package, with its file."""
+    """Every module's dotted name below the package, with its file; those of apps/ lie beside the package."""
     found = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        found[".".join(parts).removesuffix("__init__").removesuffix(".")] = path
+    for folder, paths in ((PACKAGE, PACKAGE.rglob("*.py")), (PACKAGE.parent, APPS.glob("*.py"))):
+        for path in sorted(paths):
+            parts = path.relative_to(folder).with_suffix("").parts
+            found[".".join(parts).removesuffix("__init__").removesuffix(".")] = path
     return found
 
 

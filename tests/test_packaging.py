@@ -17,7 +17,16 @@ import yaml
 import taichi_mrf
 from taichi_mrf.cli.parser import parse
 
-SOURCES = ("taichi_mrf", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE")
+SOURCES = (
+    "taichi_mrf",
+    "apps",
+    "configs",
+    "pyproject.toml",
+    "setup.py",
+    "MANIFEST.in",
+    "README.md",
+    "LICENSE",
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +68,8 @@ def test_the_wheel_holds_all_that_the_program_needs_and_no_more(wheel: Path, rep
         metadata = archive.read(info["METADATA"]).decode()
     package = (path for path in (repository / "taichi_mrf").rglob("*") if path.is_file())
     expected = {path.relative_to(repository).as_posix() for path in package if path.suffix != ".pyc"}
-    expected |= {f"taichi_mrf/configs/{path.name}" for path in (repository / "configs").glob("*.yaml")}
+    for folder, kind in (("apps", "*.py"), ("configs", "*.yaml")):
+        expected |= {f"taichi_mrf/{folder}/{path.name}" for path in (repository / folder).glob(kind)}
     assert found == expected
     assert "taichi_mrf/py.typed" in found
     assert "licenses/LICENSE" in info
@@ -86,6 +96,8 @@ def test_an_installed_wheel_maps_with_a_shipped_configuration(clean_python: Path
     arguments = ("--config", "kinect1", "--voxel-size", "0.2", "--out", "run")
     run("taichi-mrf", "map", "synthetic:room?frames=2", *arguments)
     assert (tmp_path / "run" / "report.json").is_file()
+    said = run(clean_python.name, "-m", "taichi_mrf.apps.batch", "--help")
+    assert said == run("taichi-mrf", "map", "--help")
 
 
 def dependencies(repository: Path) -> dict[str, list[str]]:
@@ -113,8 +125,8 @@ def test_the_conda_recipe_asks_for_what_the_project_asks_for(repository: Path) -
     assert python.startswith("python ")
     project = (repository / "pyproject.toml").read_text(encoding="utf-8")
     assert f'requires-python = ">={recipe["context"]["python_min"]},' in project
-    assert recipe["build"]["python"]["entry_points"] == ["taichi-mrf = taichi_mrf.cli.main:main"]
-    assert 'taichi-mrf = "taichi_mrf.cli.main:main"' in project
+    assert recipe["build"]["python"]["entry_points"] == ["taichi-mrf = taichi_mrf.cli.start:start"]
+    assert 'taichi-mrf = "taichi_mrf.cli.start:start"' in project
 
 
 def test_the_licence_of_each_dependency_is_listed(repository: Path) -> None:

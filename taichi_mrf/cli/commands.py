@@ -97,10 +97,10 @@ _LASER_FLAGS = (
 )
 
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.run:run_map", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
-    "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
-    "demo": Command(Demo, "taichi_mrf.cli.live:run_live", live_parameters, ("voxel-size", "port", "open")),
-    "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
+    "map": Command(Map, "taichi_mrf.apps.batch:run_map", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
+    "live": Command(Live, "taichi_mrf.apps.live:run_live", live_parameters, _LIVE_FLAGS),
+    "demo": Command(Demo, "taichi_mrf.apps.live:run_live", live_parameters, ("voxel-size", "port", "open")),
+    "tune": Command(Tune, "taichi_mrf.apps.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),
     "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),

@@ -262,7 +262,7 @@ class Config:
     log_odds: LogOddsConfig = field(default_factory=LogOddsConfig, metadata=IN_FILES)
     """Occupancy mapping by independent log-odds (method log_odds)."""
 
-    visibility: VisibilityConfig = field(default_factory=VisibilityConfig, metadata=IN_PYTHON)
+    visibility: VisibilityConfig = field(default_factory=VisibilityConfig, metadata=IN_FILES)
     """Visibility-aware occupancy mapping (method visibility)."""
 
     wavemap: WavemapConfig = field(default_factory=WavemapConfig, metadata=IN_PYTHON)

@@ -155,39 +155,39 @@ class LogOddsConfig:
 class VisibilityConfig:
     """Visibility-aware occupancy mapping (Schauwecker & Zell, IROS 2014).
 
-    The defaults are their Table I but for ``visible_if_occluded``: see TABLE_I.
+    The defaults are their Table I but for ``visible_if_occluded``, which is 0.2 there.
     """
 
-    hit_if_free: float = 0.43
+    hit_if_free: float = in_python(0.43)
     """P(H | V, not O): probability of a hit for a visible voxel that is free."""
 
-    hit_if_occupied: float = 0.55
+    hit_if_occupied: float = in_python(0.55)
     """P(H | V, O): probability of a hit for a visible voxel that is occupied."""
 
-    hit_if_hidden: float = 0.05
+    hit_if_hidden: float = in_python(0.05)
     """P(H | not V): probability of a hit for a voxel that is not visible."""
 
-    visible_if_occluded: float = 0.45
+    visible_if_occluded: float = in_files(0.45)
     """P(V_i | C_i, V_i-1): probability that a locally occluded voxel behind a visible one is visible. From
     0.4 on (with q_max at 0.7) rays pass unknown voxels at once; with less, as with the paper's 0.2, the map
     grows by a few voxels a frame."""
 
-    visible_if_clear: float = 1.0
+    visible_if_clear: float = in_python(1.0)
     """P(V_i | not C_i, V_i-1): probability that an unoccluded voxel behind a visible one is visible."""
 
-    q_min: float = 0.1
+    q_min: float = in_python(0.1)
     """A ray ends where the probability of visibility falls below this."""
 
-    q_max: float = 0.7
+    q_max: float = in_python(0.7)
     """A probability of visibility of at least this counts as 1."""
 
-    lowest: float = 0.1192
+    lowest: float = in_python(0.1192)
     """Lower bound on a voxel's probability (OctoMap's default)."""
 
-    highest: float = 0.971
+    highest: float = in_python(0.971)
     """Upper bound on a voxel's probability (OctoMap's default)."""
 
-    max_range: float = 0.0
+    max_range: float = in_python(0.0)
     """Cut rays off at this range (metres). The end of a cut ray counts as free. 0 means no limit."""
 
     def __post_init__(self) -> None:

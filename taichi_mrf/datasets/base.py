@@ -90,6 +90,10 @@ class StatedSensor:
     """Chance that a ray passes an occupied voxel; None for the default's 0."""
 
 
+Track = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
+"""Stamps in seconds, and the poses (4, 4) T_world_camera at them."""
+
+
 @dataclass
 class Dataset(ABC):
     """A sequence of frames that are read one at a time.
@@ -145,6 +149,15 @@ class Dataset(ABC):
         what :meth:`read` raises."""
         return self.read(index).T_world_camera
 
+    def own_poses(self) -> "Track | None":
+        """The recorded poses, with stamps of their own; None if there are only those of frames."""
+        return None
+
+    def misfit(self) -> str | None:
+        """What is wrong with the first image whose file's header says that it does not fit; None if nothing
+        is, or headers are not looked at."""
+        return None
+
     def sensor_of(self, index: int) -> str:
         """The name of the sensor that took a frame (Frame.sensor), empty if there is only one."""
         return ""
@@ -198,6 +211,13 @@ class Table(Dataset, Generic[AnyRow]):
     rows: Sequence[AnyRow] = field(kw_only=True)
     confidence: Confidence | None = field(default=None, kw_only=True)
     """Meaning of the images of confidence that come with the frames, None without."""
+
+    track: Callable[[], Track] | None = field(default=None, kw_only=True)
+    """Reads the poses with stamps of their own; None if there are only those of rows."""
+
+    def own_poses(self) -> Track | None:
+        """Those of ``track``."""
+        return None if self.track is None else self.track()
 
     @property
     def stated(self) -> StatedSensor:

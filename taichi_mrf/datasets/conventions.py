@@ -11,8 +11,9 @@ from difflib import get_close_matches
 
 from taichi_mrf.errors import ConfigError
 
-AXES = ("opengl", "ros")
-"""Axes of a camera other than the optical ones: x right, y up, z back; and x ahead, y left, z up."""
+AXES = ("opengl", "ros", "ned")
+"""Axes of a camera other than the optical ones: x right, y up, z back; x ahead, y left, z up; and x ahead, y
+right, z down, as of aircraft, whose world is north-east-down."""
 
 POSE_UNITS = {"mm": 1000.0, "cm": 100.0}
 """Units of positions other than metres, and how many are in a metre."""

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, StatedSensor
+from taichi_mrf.datasets.base import Dataset, StatedSensor, Track
 from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -58,6 +58,14 @@ class Derived(Dataset):
         """The source's."""
         return self.source.pose(index)
 
+    def own_poses(self) -> Track | None:
+        """The source's."""
+        return self.source.own_poses()
+
+    def misfit(self) -> str | None:
+        """The source's."""
+        return self.source.misfit()
+
     def sensor_of(self, index: int) -> str:
         """The source's."""
         return self.source.sensor_of(index)
@@ -73,6 +81,9 @@ class Reposed(Derived):
     """The frames of ``source``, each (by index) at its pose of ``poses``, (4, 4) T_world_camera."""
 
     poses: Mapping[int, Pose] = field(kw_only=True)
+
+    def own_poses(self) -> None:
+        """None: they are not those of the source."""
 
     def pose(self, index: int) -> Pose:
         """The frame's pose. Raises LostFrameError if it has none."""
@@ -276,6 +287,7 @@ ORIGIN_STEP_M = 1000.0
 T_AXES_OPTICAL: dict[str, NDArray[np.float64]] = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "ned": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 """The rotations that take optical axes to others."""
 
@@ -372,10 +384,10 @@ def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | Non
         origin_m = np.zeros(3) if first is None else origin_of(first[:3, 3])
     if conventions == AS_USUAL and not origin_m.any():
         return dataset
-    timed, gap_s = None, 0.0
+    timed, gap_s, said = None, 0.0, list[str]()
     if conventions.late_s:
-        dataset, timed, gap_s = _shifted(dataset, conventions, max_time_gap)
-    notes = list(dataset.notes)
+        dataset, timed, gap_s, said = _shifted(dataset, conventions, max_time_gap)
+    notes = [*dataset.notes, *said]
     if conventions != AS_USUAL:
         notes.append(f"conventions: {' '.join(conventions.flags())}")
     if origin_m.any():
@@ -407,18 +419,15 @@ def _first_pose(dataset: Dataset, conventions: Conventions) -> Pose | None:
 
 def _shifted(
     dataset: Dataset, conventions: Conventions, max_time_gap: float | None
-) -> tuple[Dataset, TimedPoses, float]:
-    """The frames that have a pose ``late_s`` later, all mended poses, and the largest gap between two."""
-    known: list[int] = []
-    poses: list[Pose] = []
-    for index in range(len(dataset)):
-        try:
-            poses.append(pose_of(dataset.pose(index), conventions))
-            known.append(index)
-        except FrameError:
-            continue
-    stamps = np.asarray(dataset.stamps(), np.float64)
-    timed = TimedPoses(stamps[known], poses)
+) -> tuple[Dataset, TimedPoses, float, list[str]]:
+    """The frames that have a pose ``late_s`` later, all mended poses, the largest gap between two, and
+    notes. Poses are interpolated in their own times where the recording has these, else in the frames'."""
+    stamps, notes = np.asarray(dataset.stamps(), np.float64), list[str]()
+    track = dataset.own_poses()
+    if track is None:
+        track = _of_frames(dataset, stamps)
+        notes.append("late: the recording has the poses of frames alone; those between are interpolated")
+    timed = TimedPoses(track[0], [pose_of(T, conventions) for T in track[1]])
     usual_s = float(np.median(np.diff(timed.stamps))) if len(timed) > 1 else 0.0
     gap_s = max_time_gap or max(INTERPOLATION_GAP, 2.0 * usual_s)
     kept = [
@@ -427,10 +436,21 @@ def _shifted(
     if not kept:
         raise DatasetError(f"{dataset.name}: no frame has a pose {conventions.late_s:g} s later")
     if len(kept) == len(dataset):
-        return dataset, timed, gap_s
+        return dataset, timed, gap_s, notes
+    notes.append(f"{len(dataset) - len(kept)} frames dropped: no poses {conventions.late_s:g} s later")
     picked: Chosen = chosen(dataset, kept)
-    picked.notes = [
-        *dataset.notes,
-        f"{len(dataset) - len(kept)} frames dropped: no poses {conventions.late_s:g} s later",
-    ]
-    return picked, timed, gap_s
+    picked.notes = list(dataset.notes)
+    return picked, timed, gap_s, notes
+
+
+def _of_frames(dataset: Dataset, stamps: NDArray[np.float64]) -> Track:
+    """The poses of the frames that have one."""
+    known: list[int] = []
+    poses: list[Pose] = []
+    for index in range(len(dataset)):
+        try:
+            poses.append(dataset.pose(index))
+            known.append(index)
+        except FrameError:
+            continue
+    return stamps[known], poses

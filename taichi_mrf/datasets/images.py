@@ -43,6 +43,18 @@ def claimed_size(data: bytes) -> Size | None:
     return size if size is not None and min(size) > 0 else None
 
 
+_HEADER = 1 << 12
+
+
+def stated_size(path: Path) -> Size | None:
+    """(width, height) by the first bytes of a file; None if they do not tell, or it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return claimed_size(file.read(_HEADER))
+    except OSError:
+        return None
+
+
 def _png(data: bytes) -> Size | None:
     width, height = struct.unpack_from(">II", data, 16)
     return (width, height) if data[12:16] == b"IHDR" else None

@@ -23,6 +23,7 @@ from taichi_mrf.datasets.images import (
     read_color,
     read_depth,
     read_grey,
+    stated_size,
 )
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.turned import of_image_size
@@ -76,6 +77,17 @@ class Recording(Table[RecordedFrame]):
     def stated(self) -> StatedSensor:
         """Sigma that the confidence is relative to, which only some folders hold."""
         return replace(super().stated, pixel_sigma=any(row.confidence_file is not None for row in self.rows))
+
+    def misfit(self) -> str | None:
+        """The first depth image whose header says another size than the camera's."""
+        for row in self.rows:
+            camera, size = row.camera or self.camera, stated_size(row.depth_file)
+            if size is not None and size != (camera.width, camera.height):
+                return (
+                    f"frame {row.name}: {row.depth_file}: the image has {size[0]} x {size[1]} pixels, the "
+                    f"camera {camera.width} x {camera.height}; --skip-bad-frames leaves such frames out"
+                )
+        return None
 
     def load(self, index: int, row: RecordedFrame, T_world_camera: Pose) -> Frame:
         """Read the images of one frame, which must have the camera's size."""

@@ -33,7 +33,8 @@ class SourceFlags:
 
     poses_are: str | None = None
     """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, with commas between: inverse
-    (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), mm or cm (unit), late=SECONDS."""
+    (T_camera_world), wxyz (w first), opengl, ros or ned (axes of the camera), mm or cm (unit),
+    late=SECONDS."""
 
     mounting: str | None = None
     """Pose of the camera in the body frame of the recorded poses: x,y,z,qx,qy,qz,qw in metres."""

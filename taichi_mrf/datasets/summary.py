@@ -71,6 +71,7 @@ def summarise(dataset: Dataset) -> Summary:
         measured, pixels = measured + seen.size, pixels + frame.depth_m.size
         centres.append(frame.T_world_camera[:3, 3])
         stamps.append(frame.stamp)
+    problem = problem or dataset.misfit()
     values = np.concatenate(depths) if depths else np.empty(0)
     low_high = np.percentile(values, [1, 99]) if values.size else None
     return Summary(

@@ -4,6 +4,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
@@ -14,12 +15,13 @@ from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 
 _AXES_WORDS = {
     "": "the optical ones: x right, y down, z ahead",
     "opengl": "OpenGL's: x right, y up, z back",
     "ros": "a robot's: x ahead, y left, z up",
+    "ned": "an aircraft's: x ahead, y right, z down",
 }
 _NO_READING = (
     "how it is written: the frames that were looked at see different things, or contradict each other in a "
@@ -29,6 +31,7 @@ _CONTRADICTING = 2 * EXPLAINED
 _MOST_EXPLAINED = 0.5
 _FEW_MATCHED, _MORE_MATCHED = 0.25, 2.0
 _WHOLE_STEP = 0.02
+_SMOOTH, _ROUGHER = 0.1, 4.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,12 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         return Diagnosis((swapped,), reading=given)
     sample = read_sample(dataset)
     steps = getattr(source, "steps_per_metre", None) or _steps(sample)
+    if _has_swapped_bytes(sample, steps):
+        text = (
+            "the two bytes of each 16-bit depth are swapped: neighbouring pixels fit the other way round; "
+            "write the images again with the bytes exchanged (numpy's byteswap)"
+        )
+        return Diagnosis((Finding(text),), reading=given)
     search = Search(sample, given, steps)
     best = search.best()
     before = search.score(given)
@@ -173,11 +182,31 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         right = steps / best.factor
         text = f"depth has {right:.6g} steps per metre ({_unit_of_depth(right)}), not {steps:.6g}"
         found.append(Finding(text, f"--depth-scale {right:.6g}"))
-    if best.lens and isinstance(source.camera, PinholeCamera):
+    if best.of_camera != given.of_camera and isinstance(source.camera, PinholeCamera):
         k = best.camera_of(source.camera)
         flag = f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
-        found.append(Finding(f"the intrinsics {best.lens}", flag))
+        if best.lens:
+            found.append(Finding(f"the intrinsics {best.lens}", flag))
+        if best.focal != given.focal:
+            text = f"the focal length is {best.focal:.2f} times the one that is stated"
+            found.append(Finding(text, flag))
+        if best.camera is not None:
+            found.append(Finding(_change(source, best.camera), flag))
     return found
+
+
+def _change(source: Dataset, camera: PinholeCamera) -> str:
+    """Where the intrinsics of images first differ, in words, when what these show is of one ``camera``."""
+    first, last = 0, len(source) - 1
+    begins = pinhole(source.read(0).camera, "doctor")
+    other = begins if begins != camera else pinhole(source.read(last).camera, "doctor")
+    while last - first > 1 and other != begins:
+        middle = (first + last) // 2
+        first, last = (first, middle) if source.read(middle).camera != begins else (middle, last)
+    return (
+        f"the intrinsics change at frame {source.frame_names[last]}, from fx {begins.fx:g} to {other.fx:g}, "
+        f"but what the images show does not: they are of fx {camera.fx:g} throughout"
+    )
 
 
 def _with_likeliest_units(best: Reading, given: Reading, steps: float, sample: Sample) -> Reading:
@@ -223,6 +252,35 @@ def _steps(sample: Sample) -> float:
         if values.size and np.abs(values * steps - np.rint(values * steps)).max() < _WHOLE_STEP:
             return steps
     return 1.0
+
+
+def _has_swapped_bytes(sample: Sample, steps: float) -> bool:
+    """True if neighbouring depths, as 16-bit numbers of ``steps`` per metre, differ far more than they do
+    with their bytes swapped. Of six clean recordings they differ by .1 to .9% of depth, and at 1000 steps per
+    metre by 15 to 50 times as much once swapped."""
+    roughness: list[tuple[float, float]] = []
+    for view in sample.views.values():
+        if not isinstance(view.camera, PinholeCamera):
+            continue
+        numbers = np.rint(view.image * steps)
+        if (
+            np.abs(view.image * steps - numbers).max() > _WHOLE_STEP
+            or numbers.max() > np.iinfo(np.uint16).max
+        ):
+            return False
+        whole = numbers.astype(np.uint16)
+        roughness.append((_roughness(whole), _roughness(whole.byteswap())))
+    if not roughness:
+        return False
+    given, swapped = np.median(roughness, axis=0)
+    return bool(swapped < _SMOOTH and given > _ROUGHER * swapped)
+
+
+def _roughness(numbers: NDArray[np.uint16]) -> float:
+    """By how much neighbours in a row differ, as a share of their mean, pixels without a depth aside."""
+    left, right = numbers[:, :-1].astype(np.float64), numbers[:, 1:].astype(np.float64)
+    both = (left > 0) & (right > 0)
+    return float(np.abs(left - right)[both].sum() / max(1.0, left[both].sum()))
 
 
 def _swapped_images(source: Dataset) -> Finding | None:

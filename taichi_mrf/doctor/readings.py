@@ -56,13 +56,36 @@ class Reading(Conventions):
     lens: str = ""
     """A key of LENSES; empty if the intrinsics are right."""
 
+    focal: float = 1.0
+    """Factor by which focal lengths must be multiplied."""
+
+    camera: PinholeCamera | None = None
+    """The camera of all images of its size, where intrinsics change that should not; None for each one's."""
+
     def camera_of(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera that took the images."""
-        return LENSES[self.lens](recorded) if self.lens else recorded
+        if self.camera is not None and self.camera.shape == recorded.shape:
+            recorded = self.camera
+        camera = LENSES[self.lens](recorded) if self.lens else recorded
+        return replace(camera, fx=camera.fx * self.focal, fy=camera.fy * self.focal)
 
     def stored_camera(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera of the images as they are stored."""
-        return _stored(self, recorded) if self.lens or self.turned else recorded
+        return _stored(self.of_camera, recorded)
+
+    @property
+    def of_camera(self) -> "Reading":
+        """What of it is of the camera alone."""
+        return Reading(
+            along_ray=self.along_ray, turned=self.turned, lens=self.lens, focal=self.focal, camera=self.camera
+        )
+
+    @property
+    def of_poses_alone(self) -> "Reading":
+        """What of it is of poses, at their own times."""
+        return replace(
+            self, late_s=0.0, along_ray=False, turned="", factor=1.0, lens="", focal=1.0, camera=None
+        )
 
 
 @cache

@@ -36,6 +36,8 @@ QUESTIONS = {
     "along_ray": "depth along the ray or the axis",
     "turned": "how images are turned",
     "lens": "the size of the intrinsics' images",
+    "camera": "whether the intrinsics change",
+    "focal": "the focal length",
     "late_s": "the time of poses",
 }
 """Question that each field of a reading answers."""
@@ -52,6 +54,8 @@ _SEEN_AGAIN, _NEARER = 0.3, 0.95
 _ROUNDS = 3
 _FEW, _MANY = 2, 8
 _LATE_STEPS_S = (0.05, 0.01)
+_FOCAL_STEPS, _FOCAL_REACH = (0.05, 0.01), 0.3
+_FOCAL_OFF, _FOCAL_PAIRS, _FOCAL_AGREE, _FOCAL_BETTER = 0.06, 8, 0.9, 1.5
 
 Options = Callable[[Reading], list[Reading]]
 
@@ -83,6 +87,7 @@ class Search:
         of_lenses = {LENSES[lens](camera): lens for camera in cameras[:1] for lens in reversed(LENSES)}
         self._has_pinholes = bool(cameras)
         self._lenses = [lens for camera, lens in of_lenses.items() if camera != cameras[0]]
+        self._cameras = dict.fromkeys(cameras) if len({camera.shape for camera in cameras}) == 1 else {}
         gaps = np.diff(sample.stamps)
         self._has_stamps = len(gaps) > 0 and bool((gaps > 0).all())
         self._gap = 3 * float(np.median(gaps)) if len(gaps) else 0.0
@@ -95,7 +100,7 @@ class Search:
 
     def moves(self, reading: Reading) -> Iterator[Pose | None]:
         """T_second_first of each pair, None where a pose is not known at the time."""
-        of_poses = replace(reading, late_s=0.0, along_ray=False, factor=1.0, lens="", turned="")
+        of_poses = reading.of_poses_alone
         if of_poses not in self._mended:
             mended = [pose_of(T, of_poses) for T in self.sample.poses]
             self._mended[of_poses] = np.array(mended).reshape(-1, 4, 4)
@@ -120,7 +125,7 @@ class Search:
 
     def _points(self, reading: Reading) -> dict[int, Floats]:
         """The points (N, 3) of each view in the camera frame."""
-        of_camera = Reading(along_ray=reading.along_ray, lens=reading.lens, turned=reading.turned)
+        of_camera = reading.of_camera
         if of_camera not in self._measured:
             views = self.sample.views.items()
             self._measured[of_camera] = {frame: points_of(view, of_camera) for frame, view in views}
@@ -183,12 +188,30 @@ class Search:
         if self._has_stamps:
             for step in _LATE_STEPS_S:
                 kept = self._best(kept, partial(self._of_time, step=step), _FEW)
+        if self._lenses:
+            for step in _FOCAL_STEPS:
+                kept = self._best(kept, partial(self._of_focal, step=step), _FEW)
         best = kept[0]
         for field in fields(Reading):
             simpler = replace(best, **{field.name: getattr(self.given, field.name)})
-            if not self.clearly_better(best, simpler):
+            tells = self._focal_tells if field.name == "focal" else self.clearly_better
+            if not tells(best, simpler):
                 best = simpler
-        return best if self.clearly_better(best, self.given) else self.given
+        tells = self._focal_tells if best == replace(self.given, focal=best.focal) else self.clearly_better
+        return best if tells(best, self.given) else self.given
+
+    def _focal_tells(self, one: Reading, other: Reading) -> bool:
+        """True if all but few pairs of frames differ less with the focal length of the one, by a third
+        together. Of the clean recordings that were tried all differ least with the one that is stated."""
+        if abs(one.focal / other.focal - 1) < _FOCAL_OFF:
+            return False
+        ours, theirs = self.differences(one), self.differences(other)
+        told = self.usable() & ~np.isnan(ours) & ~np.isnan(theirs)
+        return bool(
+            told.sum() >= _FOCAL_PAIRS
+            and (ours < theirs)[told].mean() >= _FOCAL_AGREE
+            and self.score(one) <= min(EXPLAINED, self.score(other) / _FOCAL_BETTER)
+        )
 
     def undecided(self, best: Reading) -> list[str]:
         """The assumptions whose contrary explains the frames nearly as well as the best reading does."""
@@ -232,7 +255,17 @@ class Search:
         if not self._lenses:
             return []
         ways = product((False, True), ("", *self._lenses))
-        return [replace(reading, along_ray=ray, lens=lens) for ray, lens in ways]
+        found = [replace(reading, along_ray=ray, lens=lens) for ray, lens in ways]
+        if len(self._cameras) > 1:
+            ends = (next(iter(self._cameras)), next(reversed(self._cameras)))
+            found += [replace(reading, camera=camera) for camera in ends]
+        return found
+
+    def _of_focal(self, reading: Reading, step: float) -> list[Reading]:
+        """Focal lengths that are off by up to 30% at the first step, then by something near."""
+        first = step == _FOCAL_STEPS[0]
+        count = round((_FOCAL_REACH if first else _FOCAL_STEPS[0]) / step)
+        return [replace(reading, focal=round(reading.focal + i * step, 4)) for i in range(-count, count + 1)]
 
     def _of_time(self, reading: Reading, step: float) -> list[Reading]:
         """Poses that are late or early: by up to a second at the first step, then by something near."""

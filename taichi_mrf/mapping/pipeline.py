@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S, FINAL_AFTER_S, PoseFollower, follower_of
+from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S, FINAL_AFTER_S, follower_of
 from taichi_mrf.mapping.intake import (
     HELD_OUT,
     Added,
@@ -68,121 +69,119 @@ Listener = Callable[[Event], None]
 
 
 def map_sequence(
-    dataset: Dataset,
-    config: Config,
-    listener: Listener = lambda event: None,
-    *,
-    every: int = 1,
-    limit: int | None = None,
-    skip_bad_frames: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
-    out_of_time: Callable[[], bool] = lambda: False,
-    resume_from: OccupancyMap | None = None,
-    keep: Callable[[MappingResult], None] = lambda result: None,
-    map_path: Path | None = None,
+    dataset: Dataset, config: Config, listener: Listener = lambda event: None, **options: Any
 ) -> MappingResult:
-    """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
+    """Both steps of a :class:`SequenceRun`, whose ``options`` and errors these are; returns its result."""
+    run = SequenceRun(dataset, config, listener, **options)
+    run.add_keyframes()
+    run.settle()
+    return run.result
 
-    All keyframes are added first, then the marginals are inferred. With ``config.poses.refine`` each is
-    aligned with those before it as it is added, and all with each other before the marginals are inferred.
-    Frames of a tracked dataset, those that are held out included, are first aligned with the map so far.
-    ``should_stop`` is asked between keyframes. A run that it ends makes one sweep over the keyframes there
-    are if it has not yet, so that the map is usable; ``out_of_time`` ends that sweep too. ``resume_from`` is
-    the map of such a run, of this dataset: its keyframes are kept and the frames after the last of them are
-    added, which ends in the map of an undisturbed run. ``keep`` is called after each keyframe, and may save
-    what there is for such a run. ``map_path`` is where the map will be saved: what leaves its window is
-    written beside it.
+
+class SequenceRun:
+    """Maps the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most, in two steps:
+    :meth:`add_keyframes`, then :meth:`settle`, which infers the marginals. ``result`` has the map.
+
+    With ``config.poses.refine`` each keyframe is aligned with those before it as it is added, and all with
+    each other before the marginals are inferred. Frames of a tracked dataset, those that are held out
+    included, are first aligned with the map so far. ``should_stop`` is asked between keyframes. A run that it
+    ends makes one sweep over the keyframes there are if it has not yet, so that the map is usable;
+    ``out_of_time`` ends that sweep too. ``resume_from`` is the map of such a run, of this dataset: its
+    keyframes are kept and the frames after the last of them are added, which ends in the map of an
+    undisturbed run. ``keep`` is called after each keyframe, and may save what there is for such a run.
+    ``map_path`` is where the map will be saved: what leaves its window is written beside it.
     A frame for which there is not enough memory ends the adding: the map of those before it is inferred.
     If the dataset's poses change meanwhile (datasets/pose_sources), keyframes follow them between frames, and
     after the last frame until the poses are final.
-
-    Raises FrameError for an unreadable frame unless ``skip_bad_frames``, DatasetError if no frame became a
-    keyframe or the map to resume is of another recording, ConfigError if poses are to be refined
-    or tracked in a map that cannot, and what the map raises.
     """
-    indices = range(0, len(dataset), every)[:limit]
-    if resume_from is not None:
-        check_same_frames(resume_from, dataset, indices)
-    # Refined poses depend on the map at the time: a resumed run repeats the alignment in a new map.
-    goes_on = resume_from is not None and not config.poses.refine
-    m = resume_from if resume_from is not None and goes_on else create_map(config, dataset.camera)
-    window = window_of(m)
-    if window is not None and map_path is not None:
-        window.park_beside(map_path)
-    intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
-    if intake.refiner is not None and config.poses.refine and resume_from is not None:
-        intake.refiner.repeat(resume_from.keyframes.values())
-    follower = follower_of(m, dataset, config.poses)
-    intake.result.followed = None if follower is None else follower.done
-    run = _BatchRun(
-        dataset, indices, intake, listener, should_stop, out_of_time, keep, skip_bad_frames, follower
-    )
-    run.add_keyframes()
-    if not m.keyframes:
-        raise DatasetError(_why_empty(dataset, intake.result))
-    run.follow_until_final()
-    run.align()
-    run.infer()
-    return intake.result
 
-
-@dataclass(frozen=True)
-class _BatchRun:
-    """The stages of :func:`map_sequence`."""
-
-    dataset: Dataset
-    indices: range
-    intake: Intake
-    listener: Listener
-    should_stop: Callable[[], bool]
-    out_of_time: Callable[[], bool]
-    keep: Callable[[MappingResult], None]
-    skip_bad_frames: bool
-    follower: PoseFollower | None
-
-    @property
-    def result(self) -> MappingResult:
-        return self.intake.result
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: Config,
+        listener: Listener = lambda event: None,
+        *,
+        every: int = 1,
+        limit: int | None = None,
+        skip_bad_frames: bool = False,
+        should_stop: Callable[[], bool] = lambda: False,
+        out_of_time: Callable[[], bool] = lambda: False,
+        resume_from: OccupancyMap | None = None,
+        keep: Callable[[MappingResult], None] = lambda result: None,
+        map_path: Path | None = None,
+    ) -> None:
+        """Makes the map, or goes on with one. Raises DatasetError if that is of another recording,
+        ConfigError if poses are to be refined or tracked in a map that cannot, and what the map raises."""
+        self._dataset, self._listener, self._keep = dataset, listener, keep
+        self._should_stop, self._out_of_time = should_stop, out_of_time
+        self._skip_bad_frames = skip_bad_frames
+        self._indices = range(0, len(dataset), every)[:limit]
+        if resume_from is not None:
+            check_same_frames(resume_from, dataset, self._indices)
+        # Refined poses depend on the map at the time: a resumed run repeats the alignment in a new map.
+        goes_on = resume_from is not None and not config.poses.refine
+        m = resume_from if resume_from is not None and goes_on else create_map(config, dataset.camera)
+        if map_path is not None and (window := window_of(m)) is not None:
+            window.park_beside(map_path)
+        self._intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
+        if self._intake.refiner is not None and config.poses.refine and resume_from is not None:
+            self._intake.refiner.repeat(resume_from.keyframes.values())
+        self._follower = follower_of(m, dataset, config.poses)
+        self.result = self._intake.result
+        self.result.followed = None if self._follower is None else self._follower.done
 
     def add_keyframes(self) -> None:
-        """Offer every frame that is not in the map already."""
+        """Offer every frame that is not in the map already. Raises FrameError for an unreadable frame unless
+        ``skip_bad_frames``, DatasetError if no frame became a keyframe, and what the map raises."""
+        self._offer_frames()
+        if not self.result.map.keyframes:
+            raise DatasetError(_why_empty(self._dataset, self.result))
+
+    def settle(self) -> None:
+        """Make of the keyframes the map that they give: poses that change are followed until they are final,
+        refined ones are aligned with each other, and the marginals are inferred."""
+        self._follow_until_final()
+        self._align()
+        self._infer()
+
+    def _offer_frames(self) -> None:
         mapped, last_mapped = self._go_on_from_mapped()
-        for number, index in enumerate(self.indices, start=1):
-            if self.should_stop():
+        for number, index in enumerate(self._indices, start=1):
+            if self._should_stop():
                 self.result.interrupted = True
                 return
             self.result.frames = number
-            name = self.dataset.frame_names[index]
+            name = self._dataset.frame_names[index]
             answer: Answer
             if name in mapped:
                 answer = Passed("in the map already")
-            elif self.intake.passes_unread(number, index):
+            elif self._intake.passes_unread(number, index):
                 answer = HELD_OUT
             elif index < last_mapped:
                 answer = Passed("offered before the run was resumed")
             else:
-                answer = self.intake.offer(self._read(index), number, index)
+                answer = self._intake.offer(self._read(index), number, index)
             if isinstance(answer, Full):
-                if not self.intake.map.keyframes:
+                if not self._intake.map.keyframes:
                     raise answer.error
                 self.result.full = answer.problem
                 return
-            self.listener(FrameOffered(name, number, len(self.indices), answer))
+            self._listener(FrameOffered(name, number, len(self._indices), answer))
             if isinstance(answer, Added):
-                self.keep(self.result)
+                self._keep(self.result)
                 self._follow(answer.frame.stamp)
                 if self.result.full:
                     return
 
-    def follow_until_final(self) -> None:
+    def _follow_until_final(self) -> None:
         """Let keyframes follow poses that change until these have been unchanged for FINAL_AFTER_S,
         then put each exactly where its frame was taken."""
-        follower = self.follower
+        follower = self._follower
         if follower is None:
             return
         self._follow(math.inf)
         while not (follower.is_final or self._is_stopped() or self.result.full):
-            self.listener(WaitingForPoses(min(follower.quiet_s, FINAL_AFTER_S), FINAL_AFTER_S))
+            self._listener(WaitingForPoses(min(follower.quiet_s, FINAL_AFTER_S), FINAL_AFTER_S))
             if not follower.left:
                 time.sleep(LOOK_AGAIN_S)
             self._follow(math.inf)
@@ -194,7 +193,7 @@ class _BatchRun:
 
     def _follow(self, stamp_s: float) -> None:
         """Move keyframes whose poses have changed, as many as there is time for between two frames."""
-        follower = self.follower
+        follower = self._follower
         if follower is None or self.result.full:
             return
         with self._following():
@@ -211,9 +210,9 @@ class _BatchRun:
             except CapacityError as error:
                 self.result.full = f"moving keyframes to their new poses does not fit: {error}"
 
-    def align(self) -> None:
+    def _align(self) -> None:
         """Align all keyframes with each other, if poses are refined."""
-        refiner = self.intake.refiner
+        refiner = self._intake.refiner
         if refiner is None:
             return
         told = (0, 0)
@@ -224,26 +223,26 @@ class _BatchRun:
                         for step in rounds:
                             if step.moved and (step.round, step.moved) != told:
                                 told = step.round, step.moved
-                                self.listener(step)
+                                self._listener(step)
                             if self._is_stopped():
                                 rounds.stop()
                 except CapacityError as error:
                     self.result.full = self.result.full or f"aligning the keyframes does not fit: {error}"
         self.result.poses = refiner.changes()
 
-    def infer(self) -> None:
+    def _infer(self) -> None:
         """Run the sweeps. The first always runs to its end, so that every keyframe has sent its messages,
         unless there is no time; a run that was told to stop makes no other."""
-        if self.out_of_time():
+        if self._out_of_time():
             self.result.interrupted = True
             return
         sweeps = 1 if self.result.interrupted else None
         try:
-            with self.result.timed("inferring"), FullInference(self.intake.map, sweeps) as inference:
+            with self.result.timed("inferring"), FullInference(self._intake.map, sweeps) as inference:
                 for step in inference:
-                    self.listener(step)
+                    self._listener(step)
                     if self._is_stopped():
-                        inference.stop(at_once=self.out_of_time())
+                        inference.stop(at_once=self._out_of_time())
         except CapacityError as error:
             self.result.full = f"inference does not fit: {error}"
             return
@@ -252,30 +251,30 @@ class _BatchRun:
         self.result.sweeps, self.result.residual = report.sweeps, report.residual
 
     def _is_stopped(self) -> bool:
-        self.result.interrupted = self.result.interrupted or self.should_stop()
+        self.result.interrupted = self.result.interrupted or self._should_stop()
         return self.result.interrupted
 
     def _go_on_from_mapped(self) -> tuple[set[str], int]:
         """Names of the frames that a resumed map holds already, and the index of the last of them, or -1."""
-        m, last_mapped = self.intake.map, -1
+        m, last_mapped = self._intake.map, -1
         id_of = {keyframe.name: id for id, keyframe in m.keyframes.items()}
-        for index in self.indices:
-            id = id_of.get(self.dataset.frame_names[index])
+        for index in self._indices:
+            id = id_of.get(self._dataset.frame_names[index])
             if id is not None:
-                moved = self.intake.refiner is not None and self.intake.tracker is None
-                recorded = self.dataset.read(index) if moved else m.keyframes[id]
-                self.intake.go_on_from(id, recorded.T_world_camera, self.dataset.sensor_of(index))
+                moved = self._intake.refiner is not None and self._intake.tracker is None
+                recorded = self._dataset.read(index) if moved else m.keyframes[id]
+                self._intake.go_on_from(id, recorded.T_world_camera, self._dataset.sensor_of(index))
                 last_mapped = index
         return set(id_of), last_mapped
 
     def _read(self, index: int) -> Frame | UnreadableFrame:
         with self.result.timed("reading"):
             try:
-                return self.dataset.read(index)
+                return self._dataset.read(index)
             except FrameError as error:
-                if not self.skip_bad_frames:
+                if not self._skip_bad_frames:
                     raise
-                return UnreadableFrame(self.dataset.frame_names[index], str(error))
+                return UnreadableFrame(self._dataset.frame_names[index], str(error))
 
 
 def check_same_frames(m: OccupancyMap, dataset: Dataset, indices: range) -> None:

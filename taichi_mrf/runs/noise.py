@@ -14,6 +14,9 @@ from taichi_mrf.evaluation.noise_fit import NoiseCheck, SigmaLaw
 NO_NOISE = 8.0
 """No sensor's noise differs from a stated one by so large a factor: what is wrong is something else."""
 
+HIDDEN, LEAST_HIDDEN_GAIN = 3.0, 0.005
+"""A larger factor is told where it gains few nats a pixel, too, from so many on."""
+
 
 def noise_report(
     sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None
@@ -72,6 +75,13 @@ def noise_notes(
             f"The measured depths of {check.frames} held-out frames differ from the map by "
             f"{check.factor:.2g} times what {_noise_name(sensor)} allows{_better(check.law)}. "
             f"{_advice(sensor, learnt, check)}"
+        )
+    elif check is not None and check.factor > HIDDEN and check.gain > LEAST_HIDDEN_GAIN:
+        notes.append(
+            f"The measured depths of {check.frames} held-out frames are likeliest with "
+            f"{check.factor:.2g} times what {_noise_name(sensor)} allows, but by {check.gain:.3f} nats each "
+            "only: voxels are so large that they hide the noise, and the map hardly depends on it. Smaller "
+            "voxels tell more."
         )
     return notes
 

@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import Protocol
 
 from taichi_mrf.session.outbox import Outbox
+from taichi_mrf.system.libraries import installed
 from taichi_mrf.viewer.messages import Notice, Quit, Request, Update
 
 GOODBYE_SECONDS = 0.5
@@ -60,7 +61,10 @@ class ViewerLink:
         self, host: str, port: int, serve: Serve | None = None, outbox: Outbox | None = None
     ) -> None:
         """Start the viewer; its first request will be Listening. ``serve`` is the process's main function,
-        by default the live page's; ``outbox`` decides which updates replace each other."""
+        by default the live page's; ``outbox`` decides which updates replace each other. Raises
+        ModuleNotFoundError here, and not in that process, if the library of pages is missing."""
+        if not installed("viser"):
+            raise ModuleNotFoundError("No module named 'viser'", name="viser")
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe(duplex=True)
         self._process = context.Process(

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plugged_noise import PixelNoise
 
 from taichi_mrf import open_dataset
 from taichi_mrf.calibration import from_recording
@@ -22,7 +23,8 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, SigmaLaw
+from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, NoiseCheck, SigmaLaw
+from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.sensor.frame import Frame
 
 VOXEL = 0.05
@@ -125,6 +127,28 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
         learn_sigma(camera, Config(VOXEL))
     with pytest.raises(DatasetError, match="0 held-out frames"):
         learn_sigma(chosen(room, [0, 1]), Config(VOXEL))
+
+
+class OfPixels(Derived):
+    """A recording whose frames have a noise that is no polynomial in depth."""
+
+    def read(self, index: int) -> Frame:
+        frame = self.source.read(index)
+        return replace(frame, noise=PixelNoise(np.full(frame.depth_m.shape, 0.02, np.float32)))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_noise_that_is_no_polynomial_is_the_reason_that_is_said(room: Dataset) -> None:
+    dataset = OfPixels("walk", room.camera, source=room)
+    with pytest.raises(DatasetError, match=r"noise PixelNoise of frame .* is not made of polynomials"):
+        learn_sigma(dataset, Config(VOXEL))
+
+
+@pytest.mark.parametrize(("factor", "gain", "said"), [(3.4, 0.012, 1), (3.4, 0.003, 0), (2.5, 0.012, 0)])
+def test_a_large_factor_is_told_although_voxels_hide_it(factor: float, gain: float, said: int) -> None:
+    notes = noise_notes(SensorConfig(), NoiseCheck(factor, gain, 8, 40_000), None)
+    assert len(notes) == said
+    assert all("likeliest with 3.4 times" in note and "by 0.012 nats" in note for note in notes)
 
 
 @pytest.mark.usefixtures("one_backend")

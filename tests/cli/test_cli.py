@@ -195,15 +195,6 @@ def test_version_and_info() -> None:
         assert word in done.stdout
 
 
-@pytest.mark.parametrize("name", ["batch", "live", "tune"])
-def test_the_applications_are_the_commands(name: str, repository: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(repository)}
-    app = [sys.executable, repository / "apps" / f"{name}.py", "--help"]
-    done = subprocess.run(app, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0
-    assert f"taichi-mrf {'map' if name == 'batch' else name}" in done.stdout
-
-
 def test_the_shell_is_told_how_to_complete() -> None:
     done = as_process("--tyro-print-completion", "bash")
     assert done.returncode == 0

@@ -9,7 +9,7 @@ import yaml
 from console import COARSE, FAST, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.calibration.from_recording import LearntSigma
-from taichi_mrf.cli.map import sequence
+from taichi_mrf.cli.map import reading
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags
@@ -135,7 +135,7 @@ def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     learnt = LearntSigma(SigmaLaw(1.5, 0.01), 4, 4000, 1.8, 0.1, 0.2, seconds=2.5)
-    monkeypatch.setattr(sequence, "sigma_of_glance", lambda *_, **__: learnt)
+    monkeypatch.setattr(reading, "sigma_of_glance", lambda *_, **__: learnt)
     learns, given = tmp_path / "learns", ("--noise", "given")
     for out, flags in ((learns, ()), (tmp_path / "given", given)):
         done = taichi_mrf("map", ROOM, "--out", out, "--limit", "3", *FAST, *flags)

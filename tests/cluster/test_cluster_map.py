@@ -17,8 +17,8 @@ import pytest
 from cluster_dask import dask_cluster
 
 from taichi_mrf.cli.main import main
-from taichi_mrf.cli.map.sequence import Outcome
 from taichi_mrf.cli.map.summary import summary_line, summary_row
+from taichi_mrf.cli.map.task import Outcome
 
 SOURCES = tuple(f"synthetic:room?frames={frames}&width=80&height=60" for frames in (3, 4))
 NAMES = tuple(f"synthetic_room_frames_{frames}_width_80_height_60" for frames in (3, 4))

@@ -95,8 +95,8 @@ def written(tmp_path: Path, text: str) -> Path:
         ("inference: {damping: 0.3}", "inference: damping is no longer a parameter: messages are not damped"),
         ("poses: {rounds: 5}", "poses: rounds is no longer a parameter: keyframes are aligned"),
         ("keyframes: {against: all}", "keyframes: against is no longer a parameter: a frame is compared"),
-        ("visibility: {visible_if_occluded: .2}", "visibility: visible_if_occluded is not read from files; "
-         "set it in Python, VisibilityConfig(visible_if_occluded=0.2)"),
+        ("visibility: {q_max: .2}", "visibility: q_max is not read from files; "
+         "set it in Python, VisibilityConfig(q_max=0.2)"),
         ("wavemap: {range_sigma: 0.1}", "wavemap: range_sigma is not read from files; set it in Python"),
         ("log_odds: {max_range: 5}", "log_odds: max_range is not read from files; set it in Python"),
         ("log_odds: {update: ray, hit: .8}", "LogOddsConfig(update='ray')"),

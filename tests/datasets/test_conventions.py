@@ -110,11 +110,41 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
     dataset = open_dataset(folder, camera=CAMERA, poses_are=f"late={0.5 * step}")
     assert len(dataset) == 4
     assert "1 frames dropped" in " ".join(dataset.notes)
-    half = plain.pose(1)[0, 3] / 2
-    assert np.allclose(
-        [dataset.read(i).T_world_camera[0, 3] for i in range(4)], [(2 * i + 1) * half for i in range(4)]
-    )
+    posed = np.loadtxt(folder / "groundtruth.txt", comments="#")
+    expected = np.interp(np.array(plain.stamps()[:4]) + 0.5 * step, posed[:, 0], posed[:, 1])
+    assert np.allclose([dataset.read(i).T_world_camera[0, 3] for i in range(4)], expected)
     refused(folder, "no frame has a pose 100 s later", camera=CAMERA, poses_are="late=100")
+
+
+def test_late_poses_are_interpolated_in_their_own_times(tmp_path: Path) -> None:
+    """Poses at ten times the rate of the images, on a way that bends between two images."""
+    content = Content()
+    folder = write_tum(tmp_path / "recording", content)
+    stamps = np.array(open_dataset(folder, camera=CAMERA).stamps())
+    step = stamps[1] - stamps[0]
+
+    def place(t: float) -> np.ndarray:
+        return moved(np.eye(4), [np.sin(6 * (t - stamps[0]) / step), 0.0, 0.0])
+
+    dense = np.arange(stamps[0] - step, stamps[-1] + 2 * step, step / 10)
+    write_stamped(folder / "groundtruth.txt", dense, [place(t) for t in dense])
+    plain = open_dataset(folder, camera=CAMERA)
+    assert len(plain) == len(stamps)
+    dataset = open_dataset(folder, camera=CAMERA, poses_are=f"late={0.45 * step}")
+    assert len(dataset) == len(stamps)
+    assert not any("poses of frames alone" in note for note in dataset.notes)
+    found = [dataset.read(i).T_world_camera[0, 3] for i in range(len(dataset))]
+    expected = [place(t + 0.45 * step)[0, 3] for t in stamps]
+    np.testing.assert_allclose(found, expected, atol=0.06)
+
+
+def test_where_a_recording_has_pairs_alone_late_says_so(tmp_path: Path) -> None:
+    content = Content()
+    folder = EVERY["Record3D"](tmp_path / "a", content)
+    plain = open_dataset(folder)
+    gap = float(plain.stamps()[1] - plain.stamps()[0])
+    dataset = open_dataset(folder, poses_are=f"late={gap / 2}")
+    assert any("has the poses of frames alone" in note for note in dataset.notes)
 
 
 def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ ones."""
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -46,6 +48,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
 Write = Callable[[Bag], None]
+UNSIZED = SimpleNamespace(**vars(CAMERA) | {"width": 0, "height": 0})
 OTHER = PinholeCamera(16, 12, 20.0, 20.0, 7.5, 5.5)
 LENS = (-0.2, 0.05, 0.001, -0.002, 0.0)
 
@@ -375,7 +378,8 @@ def test_each_image_has_the_camera_of_its_time(make: Make) -> None:
     dataset = open_dataset(make(own_poses, send_zeros, write))
     assert dataset.camera == CAMERA
     assert [frame.camera for frame in dataset] == cameras
-    assert f"the camera changes {len(set(cameras)) - 1} times, by its CameraInfo" in dataset.notes
+    said = f"the camera changes {len(set(cameras)) - 1} times, by its CameraInfo: from frame 000002 on fx is "
+    assert f"{said}{OTHER.fx:g}, before {CAMERA.fx:g}" in dataset.notes
 
 
 def only_color(bag: Bag) -> None:
@@ -412,6 +416,11 @@ BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
     ),
     "no such option": ((plain,), "?topic=/odom", ("unknown parameter 'topic'",)),
     "no such body": ((plain,), "?body=trailer", ("no frame 'trailer'",)),
+    "info without a size": (
+        (uninformed, own_poses, informed(cast(PinholeCamera, UNSIZED))),
+        "",
+        (INFO, "0 x 0 pixels", "--camera 14,15,7.5,5.5"),
+    ),
     "uncalibrated": ((uninformed, own_poses, send_zeros), "", (INFO, "not calibrated", "--camera")),
     "a lens that is not OpenCV's": (
         (uninformed, own_poses, informed(CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant")),

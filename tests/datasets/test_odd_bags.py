@@ -4,6 +4,7 @@ frame, each read or refused with the remedy."""
 import struct
 from collections.abc import Callable
 from functools import partial
+from operator import eq
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import bag_clouds
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from inputs_bags import (
     BODY,
     CAMERA,
@@ -39,6 +42,7 @@ from refusals import refused
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.ros.sensor import camera_of
+from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -250,24 +254,126 @@ def test_where_stamps_stand_still_the_times_of_recording_count(make: Make) -> No
     check_poses(dataset)
 
 
-def test_stamps_of_zero_are_noted(make: Make) -> None:
-    """The poses lie so much later that those of the recorded times are exact."""
+ROUNDED = 1e-6
+"""Metres: a difference of stamps, in seconds since 1970, is rounded to a quarter of a microsecond."""
 
-    def unstamped(bag: Bag) -> None:
-        header, zero = bag.header, bag.header(0.0, FRAME)
+
+def unstamped(bag: Bag, which: Callable[[int], bool], send: Callable[..., None]) -> None:
+    """Messages whose stamp is 0 where ``which`` says so of their number; all are recorded as late."""
+    header, number = bag.header, iter(range(1000))
+
+    def some(at: float, of: str) -> Any:
+        if not which(next(number)):
+            return header(at, of)
+        zero = header(at, of)
         zero.stamp = bag.message("builtin_interfaces/msg/Time", sec=0, nanosec=0)
-        bag.header = lambda at, frame: zero  # type: ignore[method-assign]
-        images(bag, info=False)
-        bag.header = header  # type: ignore[method-assign]
-        odometry(bag, late=bag.latency)
+        return zero
 
-    def calibrated(bag: Bag) -> None:
-        bag.camera_info(INFO, FRAME, CAMERA)
+    bag.header = some  # type: ignore[method-assign]
+    send(bag)
+    bag.header = header  # type: ignore[method-assign]
 
-    dataset = open_dataset(make(calibrated, unstamped, mounted))
-    check_poses(dataset)
-    said = f"the stamps of {TOPIC} are 0: the times of recording"
-    assert any(note.startswith(said) for note in dataset.notes)
+
+def info(bag: Bag) -> None:
+    bag.camera_info(INFO, FRAME, CAMERA)
+
+
+def test_stamps_of_zero_are_the_times_of_recording_less_the_delay_of_the_poses(make: Make) -> None:
+    images_alone = partial(images, info=False)
+    dataset = open_dataset(
+        make(info, partial(unstamped, which=lambda i: True, send=images_alone), odometry, mounted)
+    )
+    check_poses(dataset, atol=ROUNDED)
+    assert (
+        f"the stamps of {TOPIC} are 0: the times of recording are taken, less the 0.050 s of /odom"
+        in dataset.notes
+    )
+
+
+def test_stamps_of_zero_where_nothing_tells_the_delay_are_noted(make: Make) -> None:
+    def all_unstamped(bag: Bag) -> None:
+        unstamped(bag, lambda i: True, partial(images, info=False))
+        unstamped(bag, lambda i: True, odometry)
+
+    dataset = open_dataset(make(info, all_unstamped, mounted))
+    check_poses(dataset, atol=ROUNDED)
+    said = f"the stamps of {TOPIC} are 0: the times of recording are taken, which are later"
+    assert said in dataset.notes
+
+
+@pytest.mark.parametrize("send", [partial(images, info=False), odometry, moving_tf])
+def test_one_stamp_of_zero_is_the_time_of_recording_less_the_usual_delay(
+    make: Make, send: Callable[..., None]
+) -> None:
+    others = odometry if isinstance(send, partial) else partial(images, info=False)
+    dataset = open_dataset(
+        make(info, partial(unstamped, which=lambda i: i == 2, send=send), others, mounted, kind="mcap")
+    )
+    check_poses(dataset, atol=ROUNDED)
+    if isinstance(send, partial):
+        assert any(f"1 of {COUNT} images of {TOPIC} have a stamp that is 0" in n for n in dataset.notes)
+        assert any("less the usual 0.050 s" in note for note in dataset.notes)
+
+
+def test_a_stamp_that_is_told_by_nothing_leaves_its_image_out(make: Make) -> None:
+    """Delays grow by more than half the time between two images."""
+
+    def slower(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.latency = 0.05 + 0.08 * i
+            unstamped(bag, partial(eq, 2 - i), partial(images, info=False, numbers=[i]))
+        bag.latency = 0.05
+
+    dataset = open_dataset(make(info, slower, odometry, mounted, kind="mcap"))
+    right = [START + stamp(i) for i in range(COUNT) if i != 2]
+    np.testing.assert_allclose(dataset.stamps(), right, atol=ROUNDED)
+    assert any(f"1 of {COUNT} images of {TOPIC} left out" in note for note in dataset.notes)
+
+
+def test_a_stamp_that_is_repeated_is_mended_unless_the_image_is_too(make: Make) -> None:
+    def again(bag: Bag, image: int) -> None:
+        for i in range(COUNT):
+            header = bag.header
+            bag.header = lambda at, frame: header(stamp(1) if i == 2 else at, frame)  # type: ignore[method-assign]  # noqa: B023
+            images(bag, info=False, numbers=[i], image=lambda i: steps(image if i == 2 else i))
+            bag.header = header  # type: ignore[method-assign]
+
+    other = open_dataset(make(info, partial(again, image=2), odometry, mounted, kind="mcap"))
+    check_poses(other, atol=ROUNDED)
+    same = open_dataset(make(info, partial(again, image=1), odometry, mounted, kind="mcap"))
+    np.testing.assert_allclose(same.stamps()[2], START + stamp(1), atol=ROUNDED)
+
+
+@given(
+    st.lists(st.floats(0.01, 0.2), min_size=8, max_size=30),
+    st.floats(0.0, 0.5),
+    st.integers(0, 10**6),
+)
+def test_stamps_that_are_right_stay_and_wrong_ones_are_found(
+    gaps: list[float], delay: float, seed: int
+) -> None:
+    stamps = 1e9 + np.cumsum(gaps)
+    found, wrong = mended_stamps(stamps + delay, stamps)
+    assert not wrong.any()
+    np.testing.assert_array_equal(found, stamps)
+    bad = np.random.default_rng(seed).permutation(len(stamps))[: len(stamps) // 4]
+    given_ = stamps.copy()
+    given_[bad] = 0
+    found, wrong = mended_stamps(stamps + delay, given_)
+    np.testing.assert_array_equal(np.flatnonzero(wrong), np.sort(bad))
+    np.testing.assert_allclose(found, stamps, atol=1e-6)
+
+
+@pytest.mark.parametrize("poses", [odometry, moving_tf])
+def test_late_poses_are_interpolated_in_their_own_times(make: Make, poses: Callable[..., None]) -> None:
+    """The body goes a way that bends between two images; its poses are stamped .05 s late."""
+
+    def dense(bag: Bag) -> None:
+        poses(bag, late=0.05, numbers=np.arange(-1, COUNT, 0.1).tolist())
+
+    dataset = open_dataset(make(images, dense, mounted, kind="mcap"), poses_are="late=0.05")
+    check_poses(dataset, atol=ROUNDED)
+    assert not any("poses of frames alone" in note for note in dataset.notes)
 
 
 def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Make) -> None:

@@ -120,7 +120,7 @@ def test_this_packages_plugs_are_declared(repository: Path) -> None:
 
 def test_no_reader_is_imported_before_its_source_is_opened(repository: Path) -> None:
     program = (
-        "import sys; import taichi_mrf as tm; import taichi_mrf.cli.map.run; tm.init('cpu'); tm.MRFMap;"
+        "import sys; import taichi_mrf as tm; import taichi_mrf.apps.batch; tm.init('cpu'); tm.MRFMap;"
         "tm.open_dataset('synthetic:room?frames=1').read(0);"
         "print(*(name for name in sys.modules if name.startswith('taichi_mrf.datasets.')))"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from broken_recordings import BREAKS, FLAGS, LATE_S, of_frames, of_poses
+from broken_recordings import BREAKS, FLAGS, LATE_S, Break, late, of_depth, of_focal, of_frames, of_poses
 from console import carry_out
 from datasets_recordings import stamped_line, write_image
 from stereo_rig import write_kitti
@@ -105,6 +105,82 @@ def test_mistakes_that_come_together_are_told_apart(
     room: list[Frame], names: tuple[str, ...], flags: set[str]
 ) -> None:
     assert {each.flag for each in diagnose(of_frames(broken(room, *names))).findings} == flags
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.9, 1.1, 1.25])
+def test_a_focal_length_that_is_off_by_a_tenth_is_a_number(room: list[Frame], factor: float) -> None:
+    (finding,) = diagnose(of_frames(of_focal(factor)(room))).findings
+    assert finding.text.startswith("the focal length is ")
+    read = [float(word) for word in finding.flag.removeprefix("--camera ").split(",")]
+    np.testing.assert_allclose(read[:2], room[0].camera.fx, rtol=0.02)
+    np.testing.assert_allclose(read[2:], (room[0].camera.cx, room[0].camera.cy))
+
+
+@pytest.mark.shared_data
+def test_a_focal_length_that_is_off_by_a_tenth_is_found_in_a_kitchen(shared_data: Path) -> None:
+    frames = kitchen(shared_data)
+    (finding,) = diagnose(of_frames(of_focal(1.1)(frames))).findings
+    read = float(finding.flag.removeprefix("--camera ").split(",")[0])
+    assert abs(read / frames[0].camera.fx - 1) < 0.03
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        late(0.03),
+        of_poses(lambda T: np.block([[T[:3, :3], 1.1 * T[:3, 3:]], [0, 0, 0, 1]])),
+        of_depth(lambda f: 0.92 * f.depth_m),
+        of_focal(1.04),
+    ],
+    ids=["late", "poses of another scale", "depth of another scale", "little"],
+)
+def test_what_is_not_the_focal_length_is_not_called_so(room: list[Frame], change: Break) -> None:
+    assert not any("focal" in each.text for each in diagnose(of_frames(change(room))).findings)
+
+
+def test_intrinsics_that_change_are_named_where_the_images_do_not(room: list[Frame]) -> None:
+    wrong = [*room[:13], *of_focal(1.3)(room[13:])]
+    (finding,) = diagnose(of_frames(wrong)).findings
+    k = room[0].camera
+    assert "change at frame " + room[13].name in finding.text
+    assert f"from fx {k.fx:g} to {1.3 * k.fx:g}" in finding.text
+    assert finding.flag == f"--camera {k.fx:.6g},{k.fy:.6g},{k.cx:.6g},{k.cy:.6g}"
+
+
+def test_a_lens_that_zooms_is_as_it_should_be(room: list[Frame]) -> None:
+    scene = open_dataset("synthetic:room?frames=24", color=False).scene  # type: ignore[attr-defined]
+    frames = []
+    for i, frame in enumerate(room):
+        k = replace(frame.camera, fx=frame.camera.fx * (1 + i / 60), fy=frame.camera.fy * (1 + i / 60))
+        frames.append(replace(frame, depth_m=render(scene, k, frame.T_world_camera, False)[0], camera=k))
+    assert diagnose(of_frames(frames)).findings == ()
+
+
+def test_one_image_of_another_size_is_named_before_map_stops_at_it(
+    room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_numbered(tmp_path / "mine", room)
+    write_image(folder / "depth/0010.png", np.full((60, 80), 1000, np.uint16))
+    assert carry_out("info", folder) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert "0010.png" in said
+    assert "80 x 60 pixels, the camera 160 x 120" in said
+
+
+def test_swapped_bytes_of_depth_are_named(
+    room: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_numbered(tmp_path / "mine", room)
+    assert carry_out("doctor", folder) == 0
+    for file in sorted((folder / "depth").iterdir()):
+        write_image(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED).byteswap())
+    capsys.readouterr()
+    assert carry_out("doctor", folder) == 4
+    said = capsys.readouterr().out
+    assert said.startswith("the two bytes of each 16-bit depth are swapped")
+    assert "Nothing odd" not in said
+    with pytest.raises(ReadWrongError, match="two bytes"):
+        carry_out("map", folder, "--out", tmp_path / "out", "--quiet")
 
 
 def test_nothing_is_found_in_the_room_as_it_is(room: list[Frame]) -> None:

@@ -24,6 +24,7 @@ FLAGS = {
     "turned-left": "--image-is turned-left",
     "upside-down": "--image-is upside-down",
     "turned-right,mirrored": "--image-is turned-right,mirrored",
+    "ned": "--poses-are ned",
 }
 """Flags that mend them, or how these begin."""
 
@@ -42,6 +43,11 @@ def opengl(T: np.ndarray) -> np.ndarray:
 def body(T: np.ndarray) -> np.ndarray:
     """The pose of a body whose x is the camera's z, whose y is its -x, and whose z is its -y."""
     return np.column_stack([T[:, 2], -T[:, 0], -T[:, 1], T[:, 3]])
+
+
+def ned(T: np.ndarray) -> np.ndarray:
+    """The pose of a body whose x is the camera's z, whose y is its x, and whose z is its y."""
+    return T[:, [2, 0, 1, 3]]
 
 
 def w_first(T: np.ndarray) -> np.ndarray:
@@ -91,6 +97,13 @@ def turned(name: str) -> Break:
     return lambda frames: [change(f) for f in frames]
 
 
+def of_focal(factor: float) -> Break:
+    """Intrinsics whose focal lengths are off by a factor."""
+    return lambda frames: [
+        replace(f, camera=replace(f.camera, fx=f.camera.fx * factor, fy=f.camera.fy * factor)) for f in frames
+    ]
+
+
 LATE_S = 0.3
 BREAKS: dict[str, Break] = {
     "inverse": of_poses(inverse),
@@ -102,6 +115,7 @@ BREAKS: dict[str, Break] = {
     "late": late(LATE_S),
     "intrinsics": of_camera(2.0),
     **{name: turned(name) for name in ("turned-left", "upside-down", "turned-right,mirrored")},
+    "ned": of_poses(ned),
 }
 
 

@@ -360,12 +360,16 @@ def plain(bag: Bag) -> None:
 
 
 def check_poses(
-    dataset: Dataset, T_fixed: Pose = EYE, mount: Pose = T_body_camera, count: int = COUNT
+    dataset: Dataset,
+    T_fixed: Pose = EYE,
+    mount: Pose = T_body_camera,
+    count: int = COUNT,
+    atol: float = 1e-9,
 ) -> None:
     """Its frames are at the body's poses, seen from a fixed frame, and mounted so."""
     assert len(dataset) == count
     for i, frame in enumerate(dataset):
-        np.testing.assert_allclose(frame.T_world_camera, T_fixed @ world_body(i) @ mount, atol=1e-9)
+        np.testing.assert_allclose(frame.T_world_camera, T_fixed @ world_body(i) @ mount, atol=atol)
 
 
 def data_file(path: Path) -> Path:

@@ -20,7 +20,7 @@ PROGRAM = ("-m", "taichi_mrf")
 def with_shortest_life(seconds: float) -> tuple[str, str]:
     """The program, which starts a viewer again that has ended if it has lived for so long."""
     program = (
-        f"import sys; from taichi_mrf.cli import live; live.SHORTEST_LIFE_SECONDS = {seconds!r}; "
+        f"import sys; from taichi_mrf.cli import map_page; map_page.SHORTEST_LIFE_SECONDS = {seconds!r}; "
         "from taichi_mrf.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     return "-c", program

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.cli.map.sequence import Outcome
+from taichi_mrf.cli.map.task import Outcome
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError

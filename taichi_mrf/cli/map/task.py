@@ -4,7 +4,7 @@ finished, and may be replaced."""
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.shared import NoiseFlags
@@ -14,7 +14,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
-from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 from taichi_mrf.system import runtime
 
@@ -25,6 +25,18 @@ _RECORDED = ("voxel_size", "fit_voxel_size", "sensor.sigma", "sensor.max_depth",
 """The parameters that a run may have had from the recording."""
 
 _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
+
+
+Status = Literal["mapped", "finished before", "stopped", "failed", "refused", "not done"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a sequence: the report of its run, or one line that says why there is none."""
+
+    status: Status
+    report: dict[str, Any] | None = None
+    error: str | None = None
 
 
 @dataclass(frozen=True)
@@ -136,6 +148,16 @@ def finished_report(task: MapTask) -> dict[str, Any] | None:
     chosen = all(report.get(name) == value for name, value in task.choice().items())
     same = chosen and all(name.startswith("runtime.") for name in changed)
     return report if same and not report.get("interrupted") else None
+
+
+def finished_before(task: MapTask) -> Outcome | None:
+    """The outcome of a complete run of the same task, if the folder holds it. A folder that holds another
+    sequence is a failure."""
+    try:
+        report = finished_report(task)
+    except TaichiMRFError as error:
+        return Outcome("failed", error=str(error))
+    return None if report is None else Outcome("finished before", report)
 
 
 def report_in(folder: Path) -> dict[str, Any] | None:

@@ -10,11 +10,13 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.base import Dataset, Track
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
@@ -22,10 +24,12 @@ from taichi_mrf.datasets.recording import RecordedFrame, beside, recording
 from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
+    Trajectory,
     is_trajectory,
     poses_at_start,
     read_trajectory,
     stamps_a_second,
+    valid_poses,
 )
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -86,7 +90,14 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes.append(f"{lost} of {len(trajectory.poses)} poses of {poses.name} left out: tracking was lost")
     if dropped:
         notes.append(f"{dropped} of {len(depth)} depth images dropped: no unused pose within {gap:g} s")
-    return recording(folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(depth))
+    track = partial(_track, replace(trajectory, poses=tuple(known)))
+    return recording(folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(depth), track=track)
+
+
+def _track(trajectory: Trajectory) -> Track:
+    """The poses of a trajectory with their stamps."""
+    keys, poses = valid_poses(trajectory)
+    return keys, poses
 
 
 def _poses(folder: Path, may_lack: bool) -> Path:

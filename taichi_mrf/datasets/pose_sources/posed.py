@@ -172,6 +172,9 @@ class PosedFrames(Chosen):
         """That of the poses."""
         return np.zeros(3) if self.poses.origin_m is None else self.poses.origin_m
 
+    def own_poses(self) -> None:
+        """None: those of a file are taken in with their conventions undone."""
+
     def pose(self, index: int) -> Pose:
         """The present pose of one frame. Raises what the source raises."""
         kept = self.indices[index]

@@ -13,12 +13,13 @@ choose them.
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Table, start_pose
+from taichi_mrf.datasets.base import Dataset, Table, Track, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
@@ -31,7 +32,7 @@ from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_con
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.poses import PoseChoice, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader, Topic
-from taichi_mrf.datasets.ros.sensor import BagCameras, find_cameras, find_sensor, posed_by, poses_of
+from taichi_mrf.datasets.ros.sensor import BagCameras, find_cameras, find_sensor, posed_by, poses_of, track_of
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
@@ -130,6 +131,8 @@ class RosBag(Table[BagRow]):
         ]
         if all(found) and found[1][1.0] < min(_AGREE, 0.5 * found[0][1.0]):
             self.rows = [replace(row, pose=T) for row, T in zip(self.rows, turned, strict=True)]
+            if self.track is not None:
+                self.track = partial(_turned, self.track)
             self.notes.append(
                 f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
                 f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
@@ -159,6 +162,12 @@ class RosBag(Table[BagRow]):
             sigma_m = self.confidences.read(index, depth_m, camera)
         parts = (T_world_camera, camera, row.stamp, row.name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
+
+
+def _turned(track: Callable[[], Track]) -> Track:
+    """The poses of a body's axes as those of the camera's."""
+    stamps, poses = track()
+    return stamps, [pose_of(T, Conventions(axes="ros")) for T in poses]
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -226,6 +235,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         reader=reader,
         topic=depth.name,
         rows=_rows(reader, posed),
+        track=None if chosen.poses == TRACK else track_of(found, options),
         depth_scale=options.depth_scale,
         tracked=tracked,
         colors=colors,
@@ -262,6 +272,7 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
         reader=reader,
         topic=topic,
         rows=_rows(reader, posed),
+        track=None if tracked or registered else track_of(found, options),
         at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
         registered=registered,
         tracked=tracked,

@@ -7,6 +7,7 @@
 - Without any of these, mapping finds the poses from the images.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,6 +24,7 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
@@ -225,6 +227,7 @@ def _read_poses(
         )
     sent: dict[tuple[str, str], list[tuple[Entry, Pose]]] = {}
     broken = 0
+    unstamped: set[Entry] = set()
     for entry, message in _of_path(reader, name) if topic.type == messages.PATH else reader.messages(name):
         try:
             pose = as_pose(messages.pose_of(message))
@@ -232,11 +235,26 @@ def _read_poses(
             broken += 1
             continue
         child = frame_name(getattr(message, "child_frame_id", ""))
+        if topic.type != messages.PATH and not header_ns(message.header):
+            unstamped.add(entry)
         sent.setdefault((entry.frame, child), []).append((entry, pose))
     if not sent:
         raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a valid pose")
     (parent, child), found = _one_body(f"{reader.path}: topic {name}", sent, choice)
     found = [found[i] for i in run.part([e.stamp for e, _ in found], [e.place for e, _ in found])]
+    notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
+    stamps = [0.0 if entry in unstamped else entry.stamp for entry, _ in found]
+    if any(stamps) and not all(stamps):
+        times, wrong = mended_stamps([entry.recorded_ns / 1e9 for entry, _ in found], stamps)
+        found = [
+            (replace(entry, stamp=time), pose)
+            for (entry, pose), time in zip(found, times.tolist(), strict=True)
+            if not math.isnan(time)
+        ]
+        notes.append(
+            f"{wrong.sum()} of {len(wrong)} messages of {name} have a stamp that is 0: their times of "
+            "recording are taken, less the usual delay, or they are left out where that is not known"
+        )
     if not found:
         raise DatasetError(f"{reader.path}: topic {name} contains no pose of the run; ?run=N chooses another")
     stamps, poses = [entry.stamp for entry, _ in found], [pose for _, pose in found]
@@ -245,7 +263,6 @@ def _read_poses(
             f"{reader.path}: topic {name}: its poses jump to and fro, as of two publishers or robots: "
             "?pose=TOPIC or ?poses=FILE takes others"
         )
-    notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
     return TimedPoses(stamps, poses), parent, child, notes
 
 

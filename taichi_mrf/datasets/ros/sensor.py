@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.base import Track
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
+from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
@@ -48,21 +49,16 @@ class BagSensor:
 def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) -> BagSensor:
     """The messages of a topic that are read. Raises DatasetError, naming file and topic, if there is none, or
     no run that the user wants, or if they are of several frames and of none that the user named."""
-    recorded = [entry for entry, _ in reader.messages(topic)]
+    recorded, said = stamped(reader, topic, what)
     if not recorded:  # in a damaged file, whose index counts some
         raise DatasetError(f"{reader.path}: topic {topic} contains no message")
     frames = Counter(entry.frame for entry in recorded)
-    notes = []
+    notes = list(said)
     if choice.optical and len(frames) > 1:
         if choice.optical not in frames:
             raise DatasetError(f"{_several(reader, topic, what, frames)}: ?optical= names none of these")
         recorded = [entry for entry in recorded if entry.frame == choice.optical]
         notes.append(f"of {topic} the {len(recorded)} {what} of {choice.optical} are read")
-    if len(recorded) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in recorded}) < len(recorded):
-        recorded = [replace(entry, stamp=entry.recorded_ns / 1e9) for entry in recorded]
-        notes.append(f"the stamps of {topic} stand still: the times of recording are taken")
-    elif recorded[0].stamp == recorded[0].recorded_ns / 1e9 and _is_unstamped(reader.first(topic)):
-        notes.append(f"the stamps of {topic} are 0: the times of recording are taken, which are later")
     run, entries, said = run_of(reader, topic, recorded, choice.run, what)
     frame = choice.optical or entries[0].frame
     return BagSensor(
@@ -75,10 +71,6 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
         cache(lambda: _tree(reader, topic, frame, choice.tf, run)),
         notes + said,
     )
-
-
-def _is_unstamped(message: Any) -> bool:
-    return header_ns(message.header) == 0
 
 
 def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
@@ -133,6 +125,19 @@ def posed_by(
     )
     notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes), *dropped]
     return [(i, entries[i], pose) for i, pose in posed], notes
+
+
+def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[], Track] | None:
+    """Reads the poses of a topic's only sensor in their own times; None if there are none of these."""
+    poses = next(iter(found.values()))
+    if len(found) > 1 or not len(poses.stamps):
+        return None
+
+    def read() -> Track:
+        known = [(stamp, poses.at(stamp, largest_gap(options))) for stamp in poses.stamps]
+        return [stamp for stamp, T in known if T is not None], [T for _, T in known if T is not None]
+
+    return read
 
 
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
@@ -226,7 +231,9 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
             f"{reader.path}: topic {name}: the cameras of {', '.join(frames)} have different lenses; "
             "?optical=FRAME takes one's images only"
         )
-    cameras = BagCameras(by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame))
+    cameras = BagCameras(
+        by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame, entries)
+    )
     return _fitted(reader, depth, name, entries, cameras)
 
 
@@ -245,10 +252,20 @@ def _frame_of_info(
     )
 
 
-def _changes(by_frame: Mapping[str, Sequence[object]]) -> list[str]:
-    count = max((len(cameras) for cameras in by_frame.values()), default=1)
-    times = "once" if count == 2 else f"{count - 1} times"
-    return [f"the camera changes {times}, by its CameraInfo"] if count > 1 else []
+def _changes(
+    by_frame: Mapping[str, Sequence[tuple[float, StatedCamera]]], entries: Sequence[Entry]
+) -> list[str]:
+    """A note of cameras that change, with the number of the first image of another one."""
+    frame, stated = max(by_frame.items(), key=lambda each: len(each[1]))
+    if len(stated) == 1:
+        return []
+    times = "once" if len(stated) == 2 else f"{len(stated) - 1} times"
+    (_, old), (since, new) = stated[:2]
+    first = next((i for i, e in enumerate(entries) if e.stamp >= since and e.frame == frame), None)
+    which = f"from frame {first:06d} on " if first is not None else ""
+    return [
+        f"the camera changes {times}, by its CameraInfo: {which}fx is {new.full.fx:g}, before {old.full.fx:g}"
+    ]
 
 
 def _half_a_frame(entries: Sequence[Entry]) -> float:
@@ -306,6 +323,12 @@ def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ..
     if matrix[0, 0] <= 1:
         raise DatasetError(
             f"is not calibrated (a focal length of {matrix[0, 0]:g} pixels); pass --camera fx,fy,cx,cy"
+        )
+    if not (info.width and info.height):
+        k = ",".join(f"{matrix[i, j]:g}" for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        raise DatasetError(
+            f"says that images have {info.width} x {info.height} pixels, so nothing tells whether its "
+            f"intrinsics are theirs; --camera {k} takes them"
         )
     try:
         full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)

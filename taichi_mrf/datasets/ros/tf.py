@@ -6,10 +6,11 @@ Each robot has its own: the tree of a sensor is that of its topic's namespace, /
 frame, or about its parent, leave it disputed; what passes through it asks the user.
 """
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
@@ -248,7 +250,7 @@ def tree_of(
 
 def read_transforms(reader: RosReader) -> dict[str, Transforms]:
     """Transforms that were sent in each namespace."""
-    sent: dict[str, Transforms] = {}
+    sent: dict[str, dict[str, list[tuple[_Sent, float]]]] = {}
     for topic in reader.topics.values():
         if topic.type not in messages.TF:
             continue
@@ -261,12 +263,26 @@ def read_transforms(reader: RosReader) -> dict[str, Transforms]:
                     pose = as_pose(messages.pose_of(each))
                 except KeyframeError:
                     pose = np.full((4, 4), np.nan)  # an uninitialised transform, which leaves a gap
-                stamp = messages.header_ns(each.header) / 1e9 or entry.stamp
+                stamp = messages.header_ns(each.header) / 1e9
                 if parent and child:
-                    transforms[child].append(
-                        _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
-                    )
-    return sent
+                    row = _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
+                    transforms[child].append((row, entry.stamp))
+    return {
+        space: {child: _stamped(rows) for child, rows in transforms.items()}
+        for space, transforms in sent.items()
+    }
+
+
+def _stamped(rows: Sequence[tuple[_Sent, float]]) -> list[_Sent]:
+    """Transforms with the times of recording of their messages. Where some stamps are 0, moving ones come by
+    that time, less the usual delay; where that is not known they are left out."""
+    if all(row.stamp for row, _ in rows):
+        return [row for row, _ in rows]
+    static = [replace(row, stamp=row.stamp or recorded) for row, recorded in rows if row.is_static]
+    moving = [(row, recorded) for row, recorded in rows if not row.is_static]
+    stamps, _ = mended_stamps([recorded for _, recorded in moving], [row.stamp for row, _ in moving])
+    found = zip(moving, stamps.tolist(), strict=True)
+    return static + [replace(row, stamp=stamp) for (row, _), stamp in found if not math.isnan(stamp)]
 
 
 def _of_sensor(

@@ -37,7 +37,8 @@ SCRATCH_BYTES = 12
 
 
 class VisibilityMap(RecursiveMap[Footprint]):
-    """A map that integrates scans as Schauwecker & Zell do (IROS 2014), with their Table I as defaults.
+    """A map that integrates scans as Schauwecker & Zell do (IROS 2014), by their Table I but for a growth
+    that reaches all of an image at once (VisibilityConfig.visible_if_occluded).
 
     The effect of a scan depends on the map before it, so the order of the keyframes matters.
     """
