@@ -174,7 +174,7 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         along, word = ("ray", RANGE) if best.along_ray else ("optical axis", AXIAL)
         found.append(Finding(f"depth is measured along the {along}", f"--depth-is {word}"))
     if best.turned != given.turned:
-        words = best.turned.replace(",", " and ") or "as the sensor took them"
+        words = best.turned.replace("-", " ").replace(",", " and ") or "as the sensor took them"
         hands = "; or its poses are left-handed, and then the map is mirrored" if "mirrored" in words else ""
         flag = best.turned or "''"
         found.append(Finding(f"images are {words}{hands}", f"--image-is {flag}"))

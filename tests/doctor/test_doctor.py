@@ -244,7 +244,7 @@ def test_turned_images_are_found_and_read(room: list[Frame], states_size: bool, 
         (folder / "camera.txt").write_text(f"{k.width} {k.height} {k.fx} {k.fy} {k.cx} {k.cy}")
     found = remedy(str(folder), None, SourceFlags())
     assert f"map {folder} --image-is turned-left" in found.command
-    wrong = remedy(str(folder), None, SourceFlags(image_is="turned-right", depth_scale=1000))
+    wrong = remedy(str(folder), None, SourceFlags(image_is="turned-right", depth_scale=1000.0))
     assert f"map {folder} --depth-scale=1000.0 --image-is turned-left" in wrong.command
     read = open_dataset(folder, image_is="turned-left", depth_scale=1000, color=False)
     assert diagnose(read).findings == ()
