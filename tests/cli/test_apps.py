@@ -15,6 +15,7 @@ import pytest
 from live_program import DEADLINE_S, wait_for
 
 from taichi_mrf.cli.commands import COMMANDS
+from taichi_mrf.system import compiler
 
 APPS = {"batch": "map", "live": "live", "tune": "tune"}
 """Each file, and the command that it is."""
@@ -53,7 +54,9 @@ def python(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    """A user's, who has chosen neither a place of modules nor a compiler, as a run of the suite has."""
+    ours = ("PYTHONPATH", compiler.VARIABLE)
+    return {name: value for name, value in os.environ.items() if name not in ours}
 
 
 def run(python: Path, cwd: Path, *words: str | Path) -> "subprocess.CompletedProcess[str]":
