@@ -9,7 +9,6 @@ inferred, and what is known of it is written to the folder.
 
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ if __name__ == "__main__":  # the command line parses the options, and calls the
 
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.lines import exit_status, listener_of, print_finished, print_run
-from taichi_mrf.cli.map.reading import learnt_from, mistakes_in, open_recording
+from taichi_mrf.cli.map.reading import learnt_from, open_recording
 from taichi_mrf.cli.map.several import map_several
 from taichi_mrf.cli.map.submaps import map_submaps
 from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
@@ -122,5 +121,5 @@ def map_to_folder(
             pictures=options.pictures,
             haste=request,
             advance=progress.advance,
-            mistakes_of=partial(mistakes_in, task),
+            mistakes_of=lambda posed: task.mistakes,
         )

@@ -90,7 +90,7 @@ class StatedSensor:
     """Chance that a ray passes an occupied voxel; None for the default's 0."""
 
 
-Track = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
+StampedPoses = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
 """Stamps in seconds, and the poses (4, 4) T_world_camera at them."""
 
 
@@ -149,7 +149,7 @@ class Dataset(ABC):
         what :meth:`read` raises."""
         return self.read(index).T_world_camera
 
-    def own_poses(self) -> "Track | None":
+    def own_poses(self) -> "StampedPoses | None":
         """The recorded poses, with stamps of their own; None if there are only those of frames."""
         return None
 
@@ -212,10 +212,10 @@ class Table(Dataset, Generic[AnyRow]):
     confidence: Confidence | None = field(default=None, kw_only=True)
     """Meaning of the images of confidence that come with the frames, None without."""
 
-    track: Callable[[], Track] | None = field(default=None, kw_only=True)
+    track: Callable[[], StampedPoses] | None = field(default=None, kw_only=True)
     """Reads the poses with stamps of their own; None if there are only those of rows."""
 
-    def own_poses(self) -> Track | None:
+    def own_poses(self) -> StampedPoses | None:
         """Those of ``track``."""
         return None if self.track is None else self.track()
 

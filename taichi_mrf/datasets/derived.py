@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, StatedSensor, Track
+from taichi_mrf.datasets.base import Dataset, StampedPoses, StatedSensor
 from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -58,7 +58,7 @@ class Derived(Dataset):
         """The source's."""
         return self.source.pose(index)
 
-    def own_poses(self) -> Track | None:
+    def own_poses(self) -> StampedPoses | None:
         """The source's."""
         return self.source.own_poses()
 
@@ -443,7 +443,7 @@ def _shifted(
     return picked, timed, gap_s, notes
 
 
-def _of_frames(dataset: Dataset, stamps: NDArray[np.float64]) -> Track:
+def _of_frames(dataset: Dataset, stamps: NDArray[np.float64]) -> StampedPoses:
     """The poses of the frames that have one."""
     known: list[int] = []
     poses: list[Pose] = []

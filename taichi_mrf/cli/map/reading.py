@@ -13,8 +13,7 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
-from taichi_mrf.doctor.remedy import remedy
-from taichi_mrf.errors import DatasetError, ReadWrongError
+from taichi_mrf.errors import ReadWrongError
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.runs.files import CONFIG_FILE
 from taichi_mrf.runs.noise import contradicts
@@ -48,7 +47,7 @@ def learnt_from(
             dataset, settings, every=task.options.every, limit=task.options.limit, should_stop=request
         )
     # No noise is learnt from a recording that is not what it is taken for. The check of the map says so, too.
-    found = mistakes_in(task, dataset) if contradicts(learnt) else []
+    found = task.mistakes if contradicts(learnt) else []
     if found and not task.options.force:
         raise ReadWrongError(f"{task.source}: {'; '.join(found)}; --force maps it as it is read")
     if found and not settings.evaluation.hold_out:
@@ -61,15 +60,6 @@ def _refuse_what_is_read_wrong(task: MapTask, dataset: Dataset) -> None:
     scenes are what they are."""
     if is_rendered(task.source) or task.options.poses.follow or not doubtful_at_a_glance(dataset):
         return
-    found = mistakes_in(task, dataset)
+    found = task.mistakes
     if found:
         raise ReadWrongError(f"{task.source}: {'; '.join(found)}; --force maps it as it is read")
-
-
-def mistakes_in(task: MapTask, dataset: Dataset) -> list[str]:
-    """What is odd in a task's recording, with the command that mends it."""
-    try:
-        found = remedy(task.source, task.options.poses.file, task.options.reading)
-    except DatasetError:  # such as a recording without poses
-        return []
-    return [found.in_words()] if found.found.findings else []

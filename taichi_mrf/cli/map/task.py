@@ -3,6 +3,7 @@ finished, and may be replaced."""
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,8 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
-from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
+from taichi_mrf.doctor.remedy import remedy
+from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 from taichi_mrf.system import runtime
 
@@ -66,6 +68,15 @@ class MapTask:
     def settings(self) -> Config:
         """The parameters."""
         return self.options.settings
+
+    @cached_property
+    def mistakes(self) -> list[str]:
+        """What is odd in the recording, with the command that mends it: a look of seconds, once a run."""
+        try:
+            found = remedy(self.source, self.options.poses.file, self.options.reading)
+        except DatasetError:  # such as a recording without poses
+            return []
+        return [found.in_words()] if found.found.findings else []
 
     def choice(self) -> dict[str, Any]:
         """Choices besides the parameters; the report says them too."""

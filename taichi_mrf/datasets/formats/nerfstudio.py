@@ -83,15 +83,13 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
             )
         )
     recorded = _of_depth(path, color_cameras[order[0]], size)
-    camera = options.camera or recorded
-    if options.intrinsics is not None:
-        camera = PinholeCamera(camera.width, camera.height, *options.intrinsics)
     factor = values.get("depth_unit_scale_factor")
     steps = STEPS_PER_METRE if factor is None else 1 / _positive(path, "depth_unit_scale_factor", factor)
-    dataset = recording(
+    (lens,) = lenses
+    return recording(
         folder,
         options,
-        camera,
+        options.camera or recorded,
         rows,
         steps,
         str(path) if factor is not None else NAME,
@@ -99,10 +97,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         len(frames),
         f"{TRANSFORMS} names no depth image for them",
         scale_stated=factor is not None,
+        distortion=lens if any(lens) else (),
     )
-    (lens,) = lenses
-    dataset.distortion = lens if any(lens) else ()
-    return dataset
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Track
+from taichi_mrf.datasets.base import Dataset, StampedPoses
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
@@ -94,7 +94,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     return recording(folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(depth), track=track)
 
 
-def _track(trajectory: Trajectory) -> Track:
+def _track(trajectory: Trajectory) -> StampedPoses:
     """The poses of a trajectory with their stamps."""
     keys, poses = valid_poses(trajectory)
     return keys, poses

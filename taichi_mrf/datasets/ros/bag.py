@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Table, Track, start_pose
+from taichi_mrf.datasets.base import Dataset, StampedPoses, Table, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
@@ -164,7 +164,7 @@ class RosBag(Table[BagRow]):
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
-def _turned(track: Callable[[], Track]) -> Track:
+def _turned(track: Callable[[], StampedPoses]) -> StampedPoses:
     """The poses of a body's axes as those of the camera's."""
     stamps, poses = track()
     return stamps, [pose_of(T, Conventions(axes="ros")) for T in poses]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Track
+from taichi_mrf.datasets.base import StampedPoses
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
@@ -127,13 +127,13 @@ def posed_by(
     return [(i, entries[i], pose) for i, pose in posed], notes
 
 
-def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[], Track] | None:
+def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[], StampedPoses] | None:
     """Reads the poses of a topic's only sensor in their own times; None if there are none of these."""
     poses = next(iter(found.values()))
     if len(found) > 1 or not len(poses.stamps):
         return None
 
-    def read() -> Track:
+    def read() -> StampedPoses:
         known = [(stamp, poses.at(stamp, largest_gap(options))) for stamp in poses.stamps]
         return [stamp for stamp, T in known if T is not None], [T for _, T in known if T is not None]
 
