@@ -109,7 +109,8 @@ class RunFacts:
         """The report of the finished run."""
         report = run_report(result, self.dataset, self.source, check)
         report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
-        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt, mistakes)
+        swept_m = 0.0 if self.dataset is None else self.dataset.stated.swept_m
+        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt, mistakes, swept_m)
         told = (str(warning.message) for warning in self.warned)
         report["notes"] = list(dict.fromkeys([*report["notes"], *told]))
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
