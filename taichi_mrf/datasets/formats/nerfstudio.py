@@ -1,11 +1,12 @@
 """Nerfstudio's layout, in which Polycam, Record3D and others export depth: transforms.json and its images.
 
 ``frames`` has for each image ``transform_matrix``, T_world_camera with x right, y up and z backwards, and
-``depth_file_path``, 16-bit or float depth along the axis, which may have fewer pixels than the colour image
-``file_path``. ``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy`` (or ``camera_angle_x``) and the lens (``k1``,
-``k2``, ``p1``, ``p2``, ``k3``) are those of the colour image; a frame's own replace those of the file.
-``depth_unit_scale_factor`` are the metres of a step, a millimetre where it is missing. Poses stay where
-``applied_transform`` has moved them; if it or ``applied_scale`` has scaled them, that is undone.
+``depth_file_path``, depth along the axis, an image of 16 bits or floats or an array (``.npy``), which may
+have fewer pixels than the colour image ``file_path``. ``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy`` (or
+``camera_angle_x``) and the lens (``k1``, ``k2``, ``p1``, ``p2``, ``k3``) are those of the colour image; a
+frame's own replace those of the file. ``depth_unit_scale_factor`` are the metres of a step; where it is
+missing, floats are metres and whole numbers millimetres. Poses stay where ``applied_transform`` has moved
+them; if it or ``applied_scale`` has scaled them, that is undone.
 """
 
 import json
