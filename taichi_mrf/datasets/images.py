@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.turned import turn_hint
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
@@ -330,7 +331,7 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
     if camera is not None and (height, width) != camera.shape:
         raise DatasetError(
             f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
-            + ("; --image-is reads turned images" if (width, height) == camera.shape else "")
+            + turn_hint(camera, (width, height))
             + at_size(camera, width, height)
         )
     if width * height > MOST_PIXELS:

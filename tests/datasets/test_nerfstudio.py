@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets_recordings import CAMERA, Content, check_frames, write_nerfstudio
+from datasets_recordings import CAMERA, Content, check_frames, write_image, write_nerfstudio
 from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
@@ -135,6 +135,19 @@ def test_frames_without_depth_are_left_out(tmp_path: Path) -> None:
     dataset = open_dataset(folder)
     assert (list(dataset.frame_names), dataset.dropped) == (["frame_00002", "frame_00003"], 1)
     assert dataset.notes[0] == "1 of 3 images dropped: transforms.json names no depth image for them"
+
+
+@pytest.mark.parametrize(("turned", "quarters"), [("turned-left", 1), ("turned-right", 3)])
+def test_turned_images_of_a_camera_that_is_not_are_read_with_the_flag_and_refused_without(
+    turned: str, quarters: int, tmp_path: Path
+) -> None:
+    """``w`` and ``h`` are the sensor's, of twice the pixels of depth along each side."""
+    folder = write_nerfstudio(tmp_path / "walk", CONTENT)
+    for number, depth in enumerate(CONTENT.depth):
+        stored = np.ascontiguousarray(np.rot90(depth, quarters))
+        write_image(folder / f"depth/frame_{number + 1:05d}.png", stored)
+    refused(folder, "depth of 12 x 16 pixels", "--image-is turned-left")
+    check_frames(open_dataset(folder, image_is=turned, color=False), CONTENT, 1000.0)
 
 
 def test_a_lens_is_undone(tmp_path: Path) -> None:
