@@ -35,19 +35,20 @@ def judge_all(
 ) -> Result:
     """Figures of some views: ``readings`` -> reading -> view's name -> figures, and what they cost."""
     start = time.perf_counter()
-    by_reading: dict[str, dict[str, Figures]] = {}
-    views = [scene.views[i] for i in judged]
-    if contender.surface:
-        by_reading[""] = {view.name: _figures(judged_by_surface(m, scene, view)) for view in views}
-    for reading, changes in contender.readings.items():
-        by_reading[OMEGA if contender.surface else reading] = {
-            view.name: _figures(judged_by_voxels(m, scene, view, changes)) for view in views
-        }
+    by_reading: dict[str, dict[str, Figures]] = {"": {}} if contender.surface else {}
+    count = 0
+    for view in (scene.views[i] for i in judged):  # one at a time: a recording may have thousands
+        count += 1
+        if contender.surface:
+            by_reading[""][view.name] = _figures(judged_by_surface(m, scene, view))
+        for reading, changes in contender.readings.items():
+            name = OMEGA if contender.surface else reading
+            by_reading.setdefault(name, {})[view.name] = _figures(judged_by_voxels(m, scene, view, changes))
     seconds = time.perf_counter() - start
     return {
         "readings": by_reading,
         "build_seconds": build_seconds,
-        "judge_seconds": seconds / max(1, len(views) * len(by_reading)),
+        "judge_seconds": seconds / max(1, count * len(by_reading)),
         "bricks": m.statistics().bricks,
     }
 

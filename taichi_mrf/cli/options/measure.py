@@ -73,7 +73,8 @@ class Eval:
     """Folder for the results; created if needed."""
 
     data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
-    """Folder with the scenes, as data/README.md describes them."""
+    """Folder with the scenes, as data/README.md describes them; of table2 also a room of Redwood's, such as
+    livingroom1/."""
 
     voxel_sizes: tuple[float, ...] = ()
     """Voxel sizes in metres, instead of the experiment's own."""
