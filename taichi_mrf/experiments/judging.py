@@ -83,7 +83,7 @@ def _by_voxels(
     """All pixels with a depth, also those that do not count."""
     return judge_view(
         m, view.true_m, view.T_world_camera, view.camera or scene.camera,
-        measured_m=view.measured_m, noise=scene.noise,
+        measured_m=view.measured_m, noise=view.noise or scene.noise,
         view=m.view.with_occlusion(**changes) if changes else m.view, by="omega",
     )  # fmt: skip
 

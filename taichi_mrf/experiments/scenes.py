@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
-from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
+from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig, load
 from taichi_mrf.datasets.formats.numbered_depth import NAME as NUMBERED
 from taichi_mrf.datasets.images import read_depth
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
@@ -27,7 +27,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at
 from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.sensor.camera import Camera, pinhole
-from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.noise import NoiseModel, noise_from_config
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
 from taichi_mrf.system.files import is_folder
 
@@ -36,6 +36,9 @@ HOUSE = "house_livingroom"
 
 NOISY = "depth_noisy"
 """Folder of the simulated measurements beside Redwood's clean depth, as Open3D's downloads call it."""
+
+MAPPED_BY = "realsense_d435"
+"""Configuration of the sensor that maps where another one judges."""
 
 MOST_HELD = 64
 """Views of a folder that are kept in memory; Redwood's rooms have thousands."""
@@ -73,7 +76,8 @@ class SceneView:
     """One view. ``measured_m`` and ``true_m`` are (H, W) depth in metres, 0 for none; in a recording what was
     measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is when it
     was taken, in seconds; None if nothing is known of that. ``sigma_m`` (H, W) is the standard deviation of
-    each pixel's depth in metres; None if that of the sensor holds. ``camera`` is None for the scene's."""
+    each pixel's depth in metres; None if that of the sensor holds. ``camera`` and ``noise`` are None for the
+    scene's."""
 
     name: str
     T_world_camera: Pose
@@ -83,6 +87,7 @@ class SceneView:
     stamp_s: float | None = None
     sigma_m: NDArray[np.float32] | None = None
     camera: Camera | None = None
+    noise: NoiseModel | None = None
 
 
 class ViewsOnDemand(Sequence[SceneView]):
@@ -205,6 +210,26 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
     return Scene(
         "seven_scenes_redkitchen", pinhole(dataset.camera, "the kitchen"), noise, VolumeConfig(), 10.0, views
     )
+
+
+def judged_scene(data: Path, judge: str, seed: int = 0, limit: int | None = None) -> Scene:
+    """As MRFMap's Table III was judged: a RealSense D435 measures every second view of the house for the map,
+    and the sensor of a parameter file or of a shipped configuration the others, which judge.
+
+    What a view's sensor measures takes the place of the truth. Raises ConfigError for an unknown ``judge``.
+    """
+    sensors = [load(each).sensor for each in (MAPPED_BY, judge)]
+    clean = house_scene(data, seed, limit)
+    noises = [noise_from_config(sensor, clean.camera) for sensor in sensors]
+    views = []
+    for index, view in enumerate(clean.views):
+        sensor, noise = sensors[index % 2], noises[index % 2]
+        in_range = (view.true_m >= sensor.min_depth) & (view.true_m <= sensor.max_depth)
+        true = np.where(in_range, view.true_m, np.float32(0))
+        measured = simulate_model(true, clean.camera, noise, seed=(seed, index))
+        views.append(replace(view, measured_m=measured, true_m=measured, judged=measured > 0, noise=noise))
+    name = f"{clean.name} by {MAPPED_BY}, judged by {Path(judge).stem}"
+    return replace(clean, name=name, noise=noises[0], views=views)
 
 
 def lidar_scene(data: Path, limit: int | None = None) -> Scene:

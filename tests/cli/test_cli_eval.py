@@ -144,6 +144,8 @@ def test_table2_of_a_redwood_folder_maps_its_noise_and_judges_by_its_clean_depth
         (["peers", "--only", "attic"], ["no part matches attic"]),
         (["table3", "--data", "no/such"], ["no/such", "no such folder", "--data"]),
         (["table1", "--data", "."], ["coffin_world/clean_depth.npz", "No such file"]),
+        (["table1", "--judge", "kinect_one"], ["--judge: eval table1 is not judged by another sensor"]),
+        (["table3", "--judge", "kinect9"], ["kinect9: no such file", "kinect_one", "realsense_d435"]),
         (["table3", "--limit", "0"], ["--limit must be at least 1, not 0"]),
         (["table3", "--limit", "1"], ["seven_scenes_redkitchen: 1 views", "at least 2"]),
         (["table3", "--voxel-sizes", "0.1", "-0.2"], ["--voxel-sizes must be positive", "-0.2"]),
