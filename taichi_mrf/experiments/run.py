@@ -42,6 +42,8 @@ EXPERIMENTS = {
     "table2": Entry("taichi_mrf.experiments.table2:run_table2", (0.05, 0.02)),
     "table3": Entry("taichi_mrf.experiments.table3:run_table3", (0.05, 0.02, 0.01)),
     "fig7": Entry("taichi_mrf.experiments.fig7:run_fig7", (0.05, 0.02)),
+    "fig8": Entry("taichi_mrf.experiments.fig8:run_fig8", (0.05,)),
+    "fig9": Entry("taichi_mrf.experiments.fig8:run_fig9", (0.05, 0.02)),
     "fig10": Entry("taichi_mrf.experiments.fig10:run_fig10", (0.05, 0.02, 0.01)),
     "stereo": Entry("taichi_mrf.experiments.stereo.maps:run_stereo", (0.2,)),
     "exact": Entry("taichi_mrf.experiments.exact:run_exact", (0.05,)),

@@ -50,8 +50,7 @@ def run_table2(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     scene = living_room_scene(experiment.data, experiment.seeds[0], experiment.limit)
     require_views(scene, 2)
     ours = is_folder(experiment.data / HOUSE)
-    threshold = THRESHOLD if ours else PAPERS_THRESHOLD
-    keyframes = keyframes_of(scene, threshold, threshold)
+    keyframes, threshold = keyframes_of_room(experiment, scene)
     scored: list[Scored] = []
     occupancy: list[tuple[float, str, OccupancyScores]] = []
     for voxel_size in experiment.voxel_sizes:
@@ -85,6 +84,12 @@ def run_table2(experiment: Experiment) -> tuple[list[Table], list[Path]]:
                 draw(of_methods).savefig(temporary, dpi=130)
             paths.append(path)
     return tables, paths
+
+
+def keyframes_of_room(experiment: Experiment, scene: Scene) -> tuple[list[int], float]:
+    """The views that are mapped, and the least turn and way between them."""
+    threshold = THRESHOLD if is_folder(experiment.data / HOUSE) else PAPERS_THRESHOLD
+    return keyframes_of(scene, threshold, threshold), threshold
 
 
 def _results(

@@ -65,7 +65,7 @@ class Eval:
     """
 
     experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
-    """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker
+    """table1, table2, table3 and fig7 to fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker
     and Zell 2014, exact, which compares MRFMap with the factor graph that it approximates (Dhiman et al.
     2014), peers, which compares all mappers that are installed, or all."""
 
