@@ -61,10 +61,14 @@ def _side_by_side(
         for number, contender in enumerate(contenders):
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
             maps.append(build(contender, scene, voxel_size, keyframes)[0])
-        near = _near_surfaces(scene, voxel_size)
+        near = (
+            _near_surfaces(scene, voxel_size) if by_height else None
+        )  # a recording's own noise is near itself
         for contender, m in zip(contenders, maps, strict=True):
             centres, _ = m.decided.voxels(min_probability=0.5)
-            away = float(np.mean(~np.isin(cell_keys(centres, voxel_size), near))) if len(centres) else None
+            away = None
+            if near is not None and len(centres):
+                away = float(np.mean(~np.isin(cell_keys(centres, voxel_size), near)))
             rows.append([f"{voxel_size * 100:g} cm", contender.name, len(centres), away])
         path = experiment.out / f"{name}_{voxel_size * 1000:g}mm.png"
         with atomic_path(path) as temporary:
