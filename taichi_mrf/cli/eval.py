@@ -80,5 +80,5 @@ def _run(run: Any, name: str, entry: Any, options: Eval, console: Terminal, shou
 
         return run(
             name, entry, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report,
-            options.only,
+            options.only, options.judge,
         )  # fmt: skip

@@ -23,6 +23,7 @@ from taichi_mrf.queries.view import Answer, View
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
+from taichi_mrf.voxels.layout import BRICK
 
 Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]
 TOLERANCES: tuple[Tolerance, ...] = ("voxel", "1.5sigma", "5cm", "sensor")
@@ -42,6 +43,9 @@ OUTLIERS = 0.01
 
 MISSED = 0.2
 """Share of measurements that the measured surface does not explain where it is near the likeliest voxel."""
+
+LEFT = 0.5
+"""A ray with more visibility than this at its end has left the map; the paper does not say how much."""
 
 SURFACE_STD = 0.25
 """Standard deviation of the measured surface in voxels, as its weights have it (docs/surfaces.md)."""
@@ -132,6 +136,21 @@ class JudgedView:
             return Accuracy(float("nan"), float("nan"), image)
         right = int((image == RIGHT).sum())
         return Accuracy(right / count, 1.0 - int(answered.sum()) / count, image)
+
+    def only(self, mask: NDArray[np.bool_]) -> "JudgedView":
+        """Copy of the view in which only the pixels of a mask (H, W) count."""
+        depth, measured = (np.where(mask, image, np.float32(0)) for image in (self.depth_m, self.measured_m))
+        return replace(self, depth_m=depth, measured_m=measured)
+
+    def right_or_beyond(self, boundary_m: NDArray[np.floating]) -> float:
+        """Share of right pixels by 1.5sigma and the paper's rule for rays that leave the map (section III-D).
+
+        One that keeps more than LEFT of its visibility is right if its depth lies beyond the map's boundary,
+        (H, W) axial depth in metres. NaN if no pixel counts.
+        """
+        left = self.survey.visibility > LEFT
+        right = np.where(left, self.depth_m > boundary_m, self.answered & self._within("1.5sigma"))
+        return float(right[self.judged].mean()) if self.judged.any() else float("nan")
 
     def depth_error(self) -> DepthError:
         """Answer minus depth."""
@@ -233,6 +252,31 @@ def judge_view(
     if by == "omega" or view is not None:
         return judged_view
     return judged_view.by_surface(m.measured_depth(judged_view.answer_m, camera, T))
+
+
+def boundary_depth(
+    m: VoxelMap,
+    camera: Camera,
+    T_world_camera: ArrayLike,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Axial depth (H, W) at which a view's rays leave the map, metres; 0 for those that never enter it.
+
+    The map is a box of the world with the corners ``lower`` and ``upper``, (3,) metres, or that of all its
+    bricks.
+    """
+    T, pool, side = as_pose(T_world_camera), m.view.pool, BRICK * m.voxel_size
+    bricks = pool.bricks[pool.in_use]
+    if lower is None or upper is None:
+        if not len(bricks):
+            return np.zeros(camera.shape)
+        lower, upper = bricks.min(axis=0) * side, (bricks.max(axis=0) + 1) * side
+    directions = camera.rays() @ T[:3, :3].T
+    directions[directions == 0] = 1e-30
+    first, second = ((np.asarray(corner) - T[:3, 3]) / directions for corner in (lower, upper))
+    enter, leave = np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+    return np.where(leave > np.maximum(enter, 0.0), leave, 0.0)
 
 
 def accuracy(

@@ -36,7 +36,7 @@ class Contender:
 
     def signature(self, scene: Scene, voxel_size: float) -> str:
         """A short text that changes with any parameter of its maps."""
-        parameters = to_yaml(self.make(scene, voxel_size).config) + ("omega, surface" if self.surface else "")
+        parameters = to_yaml(self.make(scene, voxel_size).config) + f"{self.surface}, leaving"
         return hashlib.sha256(parameters.encode()).hexdigest()[:12]
 
 

@@ -43,6 +43,9 @@ class Experiment:
     only: Sequence[str] = ()
     """Patterns of the parts to run, as ``room, 10 Hz`` or ``kitchen*``; empty for all."""
 
+    judge: str | None = None
+    """Parameter file or shipped configuration of a sensor that judges Table III in the recording's place."""
+
     def wants(self, part: str) -> bool:
         """True if a part is to be run."""
         return not self.only or any(fnmatchcase(part, pattern) for pattern in self.only)

@@ -6,8 +6,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.accuracy import TOLERANCES, JudgedView, judge_view
+from taichi_mrf.evaluation.accuracy import TOLERANCES, JudgedView, boundary_depth, judge_view
 from taichi_mrf.experiments.contenders import OMEGA, Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
@@ -35,19 +36,23 @@ def judge_all(
 ) -> Result:
     """Figures of some views: ``readings`` -> reading -> view's name -> figures, and what they cost."""
     start = time.perf_counter()
-    by_reading: dict[str, dict[str, Figures]] = {}
-    views = [scene.views[i] for i in judged]
-    if contender.surface:
-        by_reading[""] = {view.name: _figures(judged_by_surface(m, scene, view)) for view in views}
-    for reading, changes in contender.readings.items():
-        by_reading[OMEGA if contender.surface else reading] = {
-            view.name: _figures(judged_by_voxels(m, scene, view, changes)) for view in views
-        }
+    by_reading: dict[str, dict[str, Figures]] = {"": {}} if contender.surface else {}
+    count, corners = 0, (scene.volume.lower, scene.volume.upper)
+    for view in (scene.views[i] for i in judged):  # one at a time: a recording may have thousands
+        count += 1
+        boundary_m = boundary_depth(m, view.camera or scene.camera, view.T_world_camera, *corners)
+        if contender.surface:
+            judged_view = _by_surface(m, scene, view, _by_voxels(m, scene, view))
+            by_reading[""][view.name] = _figures(judged_view, view, boundary_m)
+        for reading, changes in contender.readings.items():
+            name = OMEGA if contender.surface else reading
+            judged_view = _by_voxels(m, scene, view, changes)
+            by_reading.setdefault(name, {})[view.name] = _figures(judged_view, view, boundary_m)
     seconds = time.perf_counter() - start
     return {
         "readings": by_reading,
         "build_seconds": build_seconds,
-        "judge_seconds": seconds / max(1, len(views) * len(by_reading)),
+        "judge_seconds": seconds / max(1, count * len(by_reading)),
         "bricks": m.statistics().bricks,
     }
 
@@ -64,23 +69,37 @@ def judged_by_voxels(
     m: OccupancyMap, scene: Scene, view: SceneView, changes: Mapping[str, float] = MappingProxyType({})
 ) -> JudgedView:
     """A view judged by the likeliest voxels, with some changes of the map's Occlusion."""
-    return judge_view(
-        m, view.true_m, view.T_world_camera, view.camera or scene.camera,
-        measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
-        view=m.view.with_occlusion(**changes) if changes else m.view, by="omega",
-    )  # fmt: skip
+    return _by_voxels(m, scene, view, changes).only(view.judged)
 
 
 def judged_by_surface(m: OccupancyMap, scene: Scene, view: SceneView) -> JudgedView:
     """A view judged by the measured surface where that is near the likeliest voxels, else by these."""
-    judged, camera = judged_by_voxels(m, scene, view), view.camera or scene.camera
+    return _by_surface(m, scene, view, judged_by_voxels(m, scene, view))
+
+
+def _by_voxels(
+    m: OccupancyMap, scene: Scene, view: SceneView, changes: Mapping[str, float] = MappingProxyType({})
+) -> JudgedView:
+    """All pixels with a depth, also those that do not count."""
+    return judge_view(
+        m, view.true_m, view.T_world_camera, view.camera or scene.camera,
+        measured_m=view.measured_m, noise=view.noise or scene.noise,
+        view=m.view.with_occlusion(**changes) if changes else m.view, by="omega",
+    )  # fmt: skip
+
+
+def _by_surface(m: OccupancyMap, scene: Scene, view: SceneView, judged: JudgedView) -> JudgedView:
+    camera = view.camera or scene.camera
     return judged.by_surface(m.measured_depth(judged.answer_m, camera, view.T_world_camera))
 
 
-def _figures(judged: JudgedView) -> Figures:
+def _figures(every: JudgedView, view: SceneView, boundary_m: NDArray[np.float64]) -> Figures:
+    """Figures of the pixels that count, and by the paper's rule for rays that leave the map of all."""
+    judged = every.only(view.judged)
     scores = {name: judged.accuracy(name) for name in TOLERANCES}
     error = judged.depth_error()
     return {name: score.score for name, score in scores.items()} | {
+        "leaving": every.right_or_beyond(boundary_m),
         "unanswered": scores["5cm"].unanswered,
         "see_through": float(np.mean(judged.survey.visibility[judged.judged] > 0.5)),
         "median_abs": error.median_abs,

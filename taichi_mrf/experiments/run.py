@@ -42,6 +42,8 @@ EXPERIMENTS = {
     "table2": Entry("taichi_mrf.experiments.table2:run_table2", (0.05, 0.02)),
     "table3": Entry("taichi_mrf.experiments.table3:run_table3", (0.05, 0.02, 0.01)),
     "fig7": Entry("taichi_mrf.experiments.fig7:run_fig7", (0.05, 0.02)),
+    "fig8": Entry("taichi_mrf.experiments.fig8:run_fig8", (0.05,)),
+    "fig9": Entry("taichi_mrf.experiments.fig8:run_fig9", (0.05, 0.02)),
     "fig10": Entry("taichi_mrf.experiments.fig10:run_fig10", (0.05, 0.02, 0.01)),
     "stereo": Entry("taichi_mrf.experiments.stereo.maps:run_stereo", (0.2,)),
     "exact": Entry("taichi_mrf.experiments.exact:run_exact", (0.05,)),
@@ -59,6 +61,7 @@ def run_experiment(
     limit: int | None,
     progress: Progress,
     only: tuple[str, ...] = (),
+    judge: str | None = None,
 ) -> tuple[list[Table], list[Path]]:
     """Run an experiment and write its files into ``out``; returns its tables and the files.
 
@@ -68,11 +71,13 @@ def run_experiment(
     """
     if only and not entry.has_parts:
         raise ConfigError(f"--only: eval {name} has no parts that can be run alone")
+    if judge is not None and name != "table3":
+        raise ConfigError(f"--judge: eval {name} is not judged by another sensor; table3 is")
     sizes = voxel_sizes or entry.voxel_sizes
     configuration = out / f"{name}_config.yaml"
-    write_text(configuration, _configuration(name, sizes, seeds, limit))
+    write_text(configuration, _configuration(name, sizes, seeds, limit, judge))
     experiment = Experiment(
-        data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress, only
+        data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress, only, judge
     )
     module, _, function = entry.function.partition(":")
     run = getattr(importlib.import_module(module), function)
@@ -95,13 +100,16 @@ def _made_with(data: Path) -> dict[str, Any]:
     }
 
 
-def _configuration(name: str, sizes: tuple[float, ...], seeds: tuple[int, ...], limit: int | None) -> str:
+def _configuration(
+    name: str, sizes: tuple[float, ...], seeds: tuple[int, ...], limit: int | None, judge: str | None
+) -> str:
     """The exact parameters: those of the experiment, and those that every map has but for its method's."""
     head = {
         "experiment": name,
         "voxel_sizes": list(sizes),
         "seeds": list(seeds),
         "limit": limit,
+        "judge": judge,
         "version": taichi_mrf.__version__,
     }
     return (

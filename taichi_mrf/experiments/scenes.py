@@ -5,24 +5,43 @@ the truth stays known. data/README.md describes the layout of the folders.
 """
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
-from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
+from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig, load
+from taichi_mrf.datasets.formats.numbered_depth import NAME as NUMBERED
+from taichi_mrf.datasets.images import read_depth
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
+from taichi_mrf.datasets.recording import Recording
+from taichi_mrf.datasets.registry import format_name
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at
 from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.sensor.camera import Camera, pinhole
-from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.noise import NoiseModel, noise_from_config
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
+from taichi_mrf.system.files import is_folder
+
+HOUSE = "house_livingroom"
+"""Folder of Table II's own scene."""
+
+NOISY = "depth_noisy"
+"""Folder of the simulated measurements beside Redwood's clean depth, as Open3D's downloads call it."""
+
+MAPPED_BY = "realsense_d435"
+"""Configuration of the sensor that maps where another one judges."""
+
+MOST_HELD = 64
+"""Views of a folder that are kept in memory; Redwood's rooms have thousands."""
 
 COFFIN_VOLUME = ((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))
 """The walls, floor and boxes of MRFMap's Table I lie in this box; a view sees floor beyond it."""
@@ -57,7 +76,8 @@ class SceneView:
     """One view. ``measured_m`` and ``true_m`` are (H, W) depth in metres, 0 for none; in a recording what was
     measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is when it
     was taken, in seconds; None if nothing is known of that. ``sigma_m`` (H, W) is the standard deviation of
-    each pixel's depth in metres; None if that of the sensor holds. ``camera`` is None for the scene's."""
+    each pixel's depth in metres; None if that of the sensor holds. ``camera`` and ``noise`` are None for the
+    scene's."""
 
     name: str
     T_world_camera: Pose
@@ -67,6 +87,31 @@ class SceneView:
     stamp_s: float | None = None
     sigma_m: NDArray[np.float32] | None = None
     camera: Camera | None = None
+    noise: NoiseModel | None = None
+
+
+class ViewsOnDemand(Sequence[SceneView]):
+    """Views that are read when they are asked for; the last MOST_HELD are kept. ``pose`` gives T_world_camera
+    of one of them, (4, 4), and reads no image."""
+
+    def __init__(self, indices: range, read: Callable[[int], SceneView], pose: Callable[[int], Pose]) -> None:
+        """``read`` and ``pose`` are of the frame with an index."""
+        self._indices, self._read = indices, lru_cache(MOST_HELD)(read)
+        self.pose: Callable[[int], Pose] = lambda index: pose(indices[index])
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> SceneView: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[SceneView]: ...
+
+    def __getitem__(self, index: int | slice) -> SceneView | list[SceneView]:
+        if isinstance(index, slice):
+            return [self._read(i) for i in self._indices[index]]
+        return self._read(self._indices[index])
 
 
 @dataclass(frozen=True)
@@ -85,6 +130,11 @@ class Scene:
     def pinhole(self) -> PinholeCamera:
         """The camera, for what works with pinholes alone. Raises ConfigError for any other."""
         return pinhole(self.camera, self.name)
+
+    def pose(self, index: int) -> Pose:
+        """T_world_camera of a view, (4, 4)."""
+        views = self.views
+        return views.pose(index) if isinstance(views, ViewsOnDemand) else views[index].T_world_camera
 
 
 def coffin_scene(data: Path, seed: int = 0) -> Scene:
@@ -107,16 +157,45 @@ def coffin_scene(data: Path, seed: int = 0) -> Scene:
     return Scene("coffin_world", camera, noise, volume, 20.0, views)
 
 
+def living_room_scene(data: Path, seed: int = 0, limit: int | None = None) -> Scene:
+    """MRFMap's Table II: the house of ``data``, or ``data`` itself, as the paper's own room, if it is in the
+    layout of ICL-NUIM or Redwood. Raises DatasetError if it is neither."""
+    if is_folder(data / HOUSE):
+        return house_scene(data, seed, limit)
+    if (found := format_name(data)) == NUMBERED:
+        return redwood_scene(data, seed, limit)
+    what = "in no known layout" if found == "unknown" else f"in the layout of {found}"
+    raise DatasetError(
+        f"{data}: has no folder {HOUSE}/, and is {what}; --data must name the folder with the scenes, or a "
+        f"recording in that of {NUMBERED}: clean depth in depth/NNNNN.png, a Kinect's in {NOISY}/ (simulated "
+        "if it is missing), and the trajectory, as livingroom1-traj.txt"
+    )
+
+
 def house_scene(data: Path, seed: int = 0, limit: int | None = None) -> Scene:
     """In the manner of MRFMap's Table II: clean views of a living room, with the noise of a Kinect 1."""
-    dataset = open_dataset(data / "house_livingroom", color=False)
-    camera, views = pinhole(dataset.camera, "the house"), []
-    for index in range(len(dataset))[:limit]:
+    scene = redwood_scene(data / HOUSE, seed, limit)
+    return replace(scene, views=list(scene.views))
+
+
+def redwood_scene(folder: Path, seed: int = 0, limit: int | None = None) -> Scene:
+    """A folder of clean numbered depth images, and a Kinect's of the same names in NOISY; without that folder
+    its measurements are simulated. Views are read when they are asked for. Raises DatasetError."""
+    dataset, noisy = open_dataset(folder, color=False), folder / NOISY
+    camera, has_noisy = pinhole(dataset.camera, folder.name), is_folder(noisy)
+
+    def read(index: int) -> SceneView:
         frame = dataset.read(index)
-        measured = simulate(frame.depth_m, camera, KINECT_1_LATERAL, seed=(seed, index))
-        views.append(SceneView(frame.name, frame.T_world_camera, measured, frame.depth_m, frame.depth_m > 0))
+        depth = frame.depth_m
+        if has_noisy and isinstance(dataset, Recording):
+            measured = read_depth(noisy / f"{frame.name}.png", dataset.steps_per_metre, camera)
+        else:
+            measured = simulate(depth, camera, KINECT_1_LATERAL, seed=(seed, index))
+        return SceneView(frame.name, frame.T_world_camera, measured, depth, depth > 0)
+
+    views = ViewsOnDemand(range(len(dataset))[:limit], read, dataset.pose)
     noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
-    return Scene("house_livingroom", camera, noise, VolumeConfig(), 10.0, views)
+    return Scene(folder.resolve().name, camera, noise, VolumeConfig(), 10.0, views)
 
 
 def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
@@ -131,6 +210,26 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
     return Scene(
         "seven_scenes_redkitchen", pinhole(dataset.camera, "the kitchen"), noise, VolumeConfig(), 10.0, views
     )
+
+
+def judged_scene(data: Path, judge: str, seed: int = 0, limit: int | None = None) -> Scene:
+    """As MRFMap's Table III was judged: a RealSense D435 measures every second view of the house for the map,
+    and the sensor of a parameter file or of a shipped configuration the others, which judge.
+
+    What a view's sensor measures takes the place of the truth. Raises ConfigError for an unknown ``judge``.
+    """
+    sensors = [load(each).sensor for each in (MAPPED_BY, judge)]
+    clean = house_scene(data, seed, limit)
+    noises = [noise_from_config(sensor, clean.camera) for sensor in sensors]
+    views = []
+    for index, view in enumerate(clean.views):
+        sensor, noise = sensors[index % 2], noises[index % 2]
+        in_range = (view.true_m >= sensor.min_depth) & (view.true_m <= sensor.max_depth)
+        true = np.where(in_range, view.true_m, np.float32(0))
+        measured = simulate_model(true, clean.camera, noise, seed=(seed, index))
+        views.append(replace(view, measured_m=measured, true_m=measured, judged=measured > 0, noise=noise))
+    name = f"{clean.name} by {MAPPED_BY}, judged by {Path(judge).stem}"
+    return replace(clean, name=name, noise=noises[0], views=views)
 
 
 def lidar_scene(data: Path, limit: int | None = None) -> Scene:
@@ -179,9 +278,10 @@ def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]
     """Indices of the views that the geometric heuristic of section V makes keyframes."""
     selector = KeyframeSelector(KeyframeConfig(rotation=rotation, translation=translation))
     chosen = []
-    for index, view in enumerate(scene.views):
-        if selector.wants(view.T_world_camera):
-            selector.accept(view.T_world_camera)
+    for index in range(len(scene.views)):
+        pose = scene.pose(index)
+        if selector.wants(pose):
+            selector.accept(pose)
             chosen.append(index)
     return chosen
 

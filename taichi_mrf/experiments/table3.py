@@ -8,7 +8,7 @@ from taichi_mrf.evaluation.tables import Spread, Table, write_table
 from taichi_mrf.experiments.contenders import standard_contenders
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build_and_judge
-from taichi_mrf.experiments.scenes import Scene, kitchen_scene
+from taichi_mrf.experiments.scenes import MAPPED_BY, Scene, judged_scene, kitchen_scene
 from taichi_mrf.experiments.tuning import score_table, tuned_contender
 
 PAPER = {
@@ -24,7 +24,12 @@ PAPER = {
 
 def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """Accuracy on held-out real frames, and the depth error beside the sensor's own noise."""
-    scene = kitchen_scene(experiment.data, experiment.limit)
+    judge, seed = experiment.judge, experiment.seeds[0]
+    if judge is None:
+        scene, title = kitchen_scene(experiment.data, experiment.limit), "Table III: a real kitchen"
+    else:
+        scene = judged_scene(experiment.data, judge, seed, experiment.limit)
+        title = f"Table III: mapped by {MAPPED_BY}, judged by {Path(judge).stem}"
     require_views(scene, 2)
     keyframes, judged = range(0, len(scene.views), 2), range(1, len(scene.views), 2)
     mapped = f"{len(keyframes)} keyframes" + (f" of {experiment.limit} views" if experiment.limit else "")
@@ -32,30 +37,29 @@ def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     for voxel_size in experiment.voxel_sizes:
         contenders = [
             *standard_contenders(),
-            tuned_contender(experiment, scene, 0, voxel_size, keyframes),
+            tuned_contender(experiment, scene, seed, voxel_size, keyframes),
         ]
         for number, contender in enumerate(contenders):
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
             result = experiment.ledger.result(
-                fold_key(scene, 0, contender, voxel_size, mapped),
+                fold_key(scene, seed, contender, voxel_size, mapped),
                 lambda c=contender, v=voxel_size: build_and_judge(c, scene, v, keyframes, judged),  # type: ignore[misc]
             )
-            scored += flatten(result, contender.name, voxel_size, 0)
+            scored += flatten(result, contender.name, voxel_size, seed)
     noise = _sensor_noise(scene, judged)
     notes = [
         f"{scene.name}: {len(keyframes)} keyframes, {len(judged)} held-out frames, which are measurements "
         "themselves. The paper's figures are of another recording.",
         f"The sensor's own noise (its sigma at the held-out depths): median {noise:.4f} m.",
     ]
-    tables = [score_table("table3", "Table III: a real kitchen", scored, PAPER, notes)]
+    tables = [score_table("table3", title, scored, PAPER, notes)]
     return tables, [path for table in tables for path in write_table(experiment.out, table)]
 
 
 def _sensor_noise(scene: Scene, judged: range) -> float:
-    """Median over the judged pixels of the sensor's sigma at the measured depth, metres."""
-    table = scene.noise.table(scene.camera)
+    """Median over the judged pixels of their sensor's sigma at the measured depth, metres."""
     sigmas = [
-        table.at_pixels(scene.views[i].measured_m)[0][scene.views[i].judged].astype(np.float32)
-        for i in judged
+        (view.noise or scene.noise).table(scene.camera).at_pixels(view.measured_m)[0][view.judged]
+        for view in (scene.views[i] for i in judged)
     ]
     return float(np.median(np.concatenate(sigmas)))

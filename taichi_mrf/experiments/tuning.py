@@ -21,6 +21,7 @@ COLUMNS: dict[str, str] = {
     "voxel": "voxel",
     "1.5sigma": "1.5sigma",
     "5cm": "5cm",
+    "leaving": "1.5sigma, leaving",
     "unanswered": "unanswered",
     "sensor": "noisy, sensor",
     "median_abs": "median error (m)",
@@ -34,6 +35,8 @@ HOW_TO_READ = (
     "Share of pixels whose surface is right: that of the largest omega (row omega, the paper's metric), for "
     "MRFMap the measured surface where it is near. voxel = the depth lies in its voxel; "
     "1.5sigma = within 1.5 voxels (sigma = one voxel); 5cm = within 5 cm.",
+    "1.5sigma, leaving = the paper's rule of all pixels with a depth: a ray that keeps more than half of its "
+    "visibility up to the map's boundary is right if its depth lies beyond.",
     "Unanswered rays count as wrong. noisy, sensor = the noisy depth within 1.5 sigma of what the sensor "
     "would measure of that surface. Log-likelihood: mean per measured pixel, nats, density per metre.",
 )

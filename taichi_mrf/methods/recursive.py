@@ -130,7 +130,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def stale(self) -> bool:
-        """True if keyframes were removed or moved since the voxels were last computed."""
+        """True if keyframes were removed or moved, or with a half-life came late, since the voxels were last
+        computed."""
         return self._stale
 
     @property
@@ -156,7 +157,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         no_return: ArrayLike | None = None,
         pose_covariance: ArrayLike | None = None,
     ) -> int:
-        """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
+        """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does. With a
+        half-life a scan that is older than another one makes the map stale.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
@@ -185,6 +187,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)
         name = name or f"keyframe {self._next_id}"
         record = StoredKeyframe(self._next_id, name, depth, T, camera, self._stamp(stamp_s), own=own)
+        if not self.config.time.is_static and record.stamp_s < self._newest_s:
+            self._stale = True  # it counts less than those that came before it
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
@@ -217,10 +221,10 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         keyframes: Iterable[int] | None = None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Rebuild the map if keyframes were removed or moved; otherwise do nothing.
+        """Rebuild the map if it is stale; otherwise do nothing.
 
-        All scans are integrated again in the order in which they were added. The result is the map of these
-        scans alone. ``sweeps``, ``tolerance`` and ``keyframes`` are arguments of MRFMap.infer; here they are
+        All scans are integrated again in the order in which they were added, with a half-life in that of
+        their stamps. The result is the map of these scans alone. ``sweeps``, ``tolerance`` and ``keyframes`` are arguments of MRFMap.infer; here they are
         checked and ignored. ``progress`` is called after each scan; if it returns False, the map holds the
         scans up to there and stays stale. Raises CapacityError if there is not enough memory.
         """
@@ -237,6 +241,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             self._find(id)
         begin = time.perf_counter()
         records = list(self._keyframes.values()) if self._stale else []
+        if not self.config.time.is_static:
+            records.sort(key=lambda record: record.stamp_s)
         if self._stale:
             self._forget_voxels()
         rays, done, complete = 0, 0, True
@@ -323,7 +329,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         runtime.settle()  # before the image's arrays are dropped
 
     def _fade(self, stamp_s: float) -> None:
-        """Let the time up to a new scan pass for all voxels; a scan from the past changes nothing."""
+        """Let the time up to a new scan, the newest, pass for all voxels."""
         forgotten = (
             self.config.time.forgotten(stamp_s - self._newest_s) if self._newest_s > -math.inf else 0.0
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from hand_made import (
+    BRICK_M,
     CAMERA,
     SQUARE_ON,
     THIN,
@@ -35,6 +36,7 @@ from taichi_mrf.evaluation.accuracy import (
     JudgedView,
     Tolerance,
     accuracy,
+    boundary_depth,
     judge_view,
 )
 from taichi_mrf.geometry.poses import Pose, look_at
@@ -425,3 +427,51 @@ def test_a_view_is_judged_by_a_surface_where_there_is_one() -> None:
     densities.insert(1, 4.0 + 0.5 / 10.0)
     expected = [math.log((1 - OUTLIERS) * each + OUTLIERS / 10.0) for each in densities]
     np.testing.assert_allclose(found.log_densities(), expected, atol=2e-5)  # depths are float32
+
+
+def test_a_ray_that_leaves_the_map_is_right_if_its_depth_lies_beyond() -> None:
+    # Within 1.5 voxels, and not; through and beyond, and short of it; met nothing and beyond; not judged.
+    middle = np.array([[2.0, 2.0, 2.0, 2.0, 0.0, 2.0]], np.float32)
+    kept = np.array([[0.4, 0.4, 0.6, 0.6, 1.0, 0.0]], np.float32)
+    depth_m = np.array([[2.1, 2.2, 3.1, 2.0, 3.1, 0.0]], np.float32)
+    half = np.where(middle > 0, np.float32(0.05), np.float32(0))
+    survey = SurfaceSurvey(middle - half, middle + half, kept, middle, np.zeros_like(kept))
+    table = PolynomialNoise((0.1,)).table(PinholeCamera(6, 1, 10.0, 10.0, 2.5, 0.0))
+    judged = JudgedView(depth_m, depth_m, survey, 0.1, 10.0, table)
+    assert judged.accuracy("1.5sigma").score == 2 / 5
+    assert judged.right_or_beyond(np.full((1, 6), 3.0)) == pytest.approx(3 / 5)
+    assert judged.right_or_beyond(np.full((1, 6), 4.0)) == pytest.approx(1 / 5)
+    first = judged.only(np.arange(6)[None] == 0)
+    assert first.right_or_beyond(np.zeros((1, 6))) == first.accuracy("1.5sigma").score == 1
+    assert np.isnan(judged.only(depth_m < 0).right_or_beyond(np.zeros((1, 6))))
+
+
+@pytest.mark.parametrize("pose", VIEWS)
+def test_rays_leave_the_map_where_the_box_of_its_bricks_ends(random_map: HandMade, pose: Pose) -> None:
+    found = boundary_depth(PoolMap(random_map.pool), CAMERA, pose)
+    lower = random_map.bricks.min(axis=0) * BRICK_M
+    upper = (random_map.bricks.max(axis=0) + 1) * BRICK_M
+    step = 0.01
+    depths = np.arange(step, 12.0, step)
+    inside = np.zeros((len(depths), *CAMERA.shape), bool)
+    for i, depth in enumerate(depths):
+        points = depth * CAMERA.rays() @ pose[:3, :3].T + pose[:3, 3]
+        inside[i] = ((points > lower) & (points < upper)).all(axis=-1)
+    last = len(depths) - 1 - np.argmax(inside[::-1], axis=0)
+    entered = inside.any(axis=0)
+    assert entered.any()
+    np.testing.assert_allclose(found[entered], depths[last][entered], atol=step)
+    assert (found[~entered] > 0).sum() <= 0.1 * (~entered).sum()  # a corner cut by less than a step
+    corners = lower + 0.1, upper - 0.1
+    assert (boundary_depth(PoolMap(random_map.pool), CAMERA, pose, *corners) <= found).all()
+
+
+def test_the_boundary_of_a_ray_along_its_face_and_of_no_map() -> None:
+    row = PoolMap(row_of_voxels(np.zeros(16)))
+    assert boundary_depth(row, SQUARE_ON, row_pose(-0.3)).item() == pytest.approx(1.1)
+    assert boundary_depth(row, SQUARE_ON, row_pose(0.5)).item() == pytest.approx(0.3)
+    assert boundary_depth(row, SQUARE_ON, row_pose(0.9)).item() == 0
+    along_x = np.array([[0, 0, 1, -0.3], [-1, 0, 0, 0.175], [0, -1, 0, 0.175], [0, 0, 0, 1.0]])
+    in_a_face = boundary_depth(row, SQUARE_ON, along_x, (0, 0.175, 0), (0.8, 0.4, 0.4))
+    assert in_a_face.item() == pytest.approx(1.1)
+    assert boundary_depth(PoolMap(BrickPool(-2.2)), SQUARE_ON, row_pose(0.0)).item() == 0

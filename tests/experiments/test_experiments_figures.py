@@ -1,6 +1,7 @@
 """Figures 7 and 10 on a small room: the ray and the scores that are shown, and what another image costs."""
 
 import csv
+import itertools
 from functools import partial
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
 from taichi_mrf.experiments.fig7 import COLORS, NAMES, beside_an_edge, run_fig7
+from taichi_mrf.experiments.fig8 import run_fig8, run_fig9
 from taichi_mrf.experiments.fig10 import FULL_AT, run_fig10
-from taichi_mrf.experiments.scenes import SceneView, coffin_scene
+from taichi_mrf.experiments.scenes import SceneView, coffin_scene, house_scene
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 
@@ -45,6 +47,38 @@ def test_fig7_shows_the_held_out_view(data: Path, tmp_path: Path) -> None:
             score = judged.accuracy("1.5sigma")
             expected.append([f"{size * 100:g} cm", name, score.score, score.unanswered])
     assert table.rows == expected
+
+
+def test_fig8_draws_both_maps_and_counts_what_is_away_from_surfaces(data: Path, tmp_path: Path) -> None:
+    (table,), paths = run_fig8(experiment(data, tmp_path, voxel_sizes=(0.1,)))
+    assert [path.name for path in paths] == ["fig8.csv", "fig8.tex", "fig8.png", "fig8_100mm.png"]
+    scene = house_scene(data)
+    ends = []
+    for view in scene.views:
+        rays = scene.camera.rays()[view.judged] * view.true_m[view.judged][:, None]
+        ends.append(rays @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3])
+    near = {tuple(each) for each in np.floor(np.concatenate(ends) / 0.1).astype(int).tolist()}
+    beside = list(itertools.product((-1, 0, 1), repeat=3))
+    for row, make in zip(table.rows, (LogOddsMap, partial(MRFMap, ray_density=0.0)), strict=True):
+        m = make(0.1, scene.noise, volume=scene.volume, max_depth=scene.max_depth)
+        for each in (scene.views[i] for i in (0, 2, 4)):
+            m.add_keyframe(each.measured_m, each.T_world_camera, scene.camera, each.name)
+        m.infer()
+        voxels = np.floor(m.decided.voxels(min_probability=0.5)[0] / 0.1).astype(int)
+        away = [not any(tuple(v + step) in near for step in beside) for v in voxels]
+        assert row[2:] == [len(voxels), pytest.approx(np.mean(away))]
+    picture = cv2.imread(str(paths[-1]))
+    left, right = np.array_split(picture, 2, axis=1)
+    assert min(len(np.unique(half.reshape(-1, 3), axis=0)) for half in (left, right)) > 1000
+
+
+def test_fig9_is_coloured_by_probability(data: Path, tmp_path: Path) -> None:
+    _, paths = run_fig9(experiment(data, tmp_path, voxel_sizes=(0.1,)))
+    picture = cv2.imread(str(paths[-1]))[:, :, ::-1].astype(int)
+    bright_yellow = (picture[..., 0] > 180) & (picture[..., 1] > 180) & (picture[..., 2] < 80)
+    assert bright_yellow.mean() > 0.002
+    with pytest.raises(ConfigError, match="0 views; the experiment needs at least 1"):
+        run_fig9(experiment(data, tmp_path, voxel_sizes=(0.1,), limit=0))
 
 
 def test_each_kind_of_pixel_has_its_colour() -> None:

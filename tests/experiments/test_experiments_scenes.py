@@ -21,6 +21,7 @@ from taichi_mrf.experiments.scenes import (
     SceneView,
     coffin_scene,
     house_scene,
+    judged_scene,
     keyframes_of,
     kitchen_scene,
 )
@@ -293,3 +294,24 @@ def test_the_real_coffin(shared_data: Path) -> None:
         where = (where + view.T_world_camera[:3, 3])[view.judged]
         assert (where.min(axis=0) >= np.array(COFFIN_VOLUME[0]) - 0.02).all()
         assert (where.max(axis=0) <= np.array(COFFIN_VOLUME[1]) + 0.02).all()
+
+
+def test_another_sensor_judges_the_views_that_are_not_mapped(data: Path, tmp_path: Path) -> None:
+    judge = tmp_path / "near.yaml"
+    judge.write_text("sensor: {sigma: [0.5], bias: [0.1], min_depth: 1.0, max_depth: 3.0}\n")
+    scene, clean = judged_scene(data, str(judge), 2), house_scene(data)
+    assert scene.name == "house_livingroom by realsense_d435, judged by near"
+    errors = {True: [], False: []}
+    for index, (view, true) in enumerate(zip(scene.views, clean.views, strict=True)):
+        in_range = (true.true_m >= 1) & (true.true_m <= 3) if index % 2 else true.true_m >= 0.2
+        assert not view.judged[~in_range].any()
+        np.testing.assert_array_equal(view.judged, view.measured_m > 0)
+        np.testing.assert_array_equal(view.true_m, view.measured_m)
+        errors[bool(index % 2)].append((view.measured_m - true.true_m)[view.judged])
+        table = view.noise.table(CAMERA) if view.noise else None
+        assert table is not None
+        sigma, _ = table.at_pixels(np.full(CAMERA.shape, 2.0))
+        np.testing.assert_allclose(sigma, 0.5 if index % 2 else 0.0037736 * 4, rtol=1e-5)
+    assert np.std(np.concatenate(errors[True])) == pytest.approx(0.5, rel=0.1)
+    assert np.mean(np.concatenate(errors[True])) == pytest.approx(0.1, abs=0.03)
+    assert np.std(np.concatenate(errors[False])) < 0.05

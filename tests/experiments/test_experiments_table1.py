@@ -75,11 +75,21 @@ def row_of(table: Table, *key: str) -> Row:
 def figures_by_hand(m: OccupancyMap, scene: Scene, fold: int, view: View | None = None) -> dict[str, float]:
     """Every figure of the table, of one held-out view; by omega through ``view``, if there is one."""
     seen = scene.views[fold]
-    judged = judge_view(
-        m, seen.true_m, seen.T_world_camera, scene.camera,
-        measured_m=seen.measured_m, noise=scene.noise, mask=seen.judged, view=view,
+    judged, every = (
+        judge_view(
+            m, seen.true_m, seen.T_world_camera, scene.camera,
+            measured_m=seen.measured_m, noise=scene.noise, mask=mask, view=view,
+        )
+        for mask in (seen.judged, None)
     )  # fmt: skip
     figures = {name: judged.accuracy(name).score for name in TOLERANCES}
+    # The camera stands in the volume, so what lies beyond its boundary lies outside.
+    rays = scene.camera.rays() * seen.true_m[..., None].astype(np.float64)
+    ends = rays @ seen.T_world_camera[:3, :3].T + seen.T_world_camera[:3, 3]
+    outside = ((ends < scene.volume.lower) | (ends > scene.volume.upper)).any(axis=-1)
+    near = every.answered & (abs(seen.true_m - every.survey.middle.astype(float)) <= 1.5 * m.voxel_size)
+    right = np.where(every.survey.visibility > 0.5, outside, near)[every.judged]
+    figures["leaving"] = right.mean()
     figures["unanswered"] = judged.accuracy("5cm").unanswered
     figures["median_abs"] = judged.depth_error().median_abs
     figures["rms"] = judged.depth_error().rms

@@ -203,6 +203,21 @@ def test_table3_goes_on_where_it_was(third: tuple, data: Path) -> None:
     assert path.read_bytes() == before
 
 
+def test_table3_is_judged_with_the_noise_of_another_sensor(data: Path, tmp_path: Path) -> None:
+    judge = tmp_path / "coarse.yaml"
+    judge.write_text("sensor: {sigma: [0.3], min_depth: 0.1, max_depth: 10.0}\n")
+    rows = {}
+    for name in ("kinect_one", str(judge)):
+        run = experiment(data, tmp_path / Path(name).stem, voxel_sizes=(0.1,), judge=name)
+        (table,), _ = run_table3(run)
+        rows[name] = row_of(table, "MRFMap")
+        assert table.title == f"Table III: mapped by realsense_d435, judged by {Path(name).stem}"
+        assert rows[name]["views"] == HOUSE_VIEWS // 2
+    # A judge with a sigma of 30 cm finds few depths within 5 cm; what it measures fits its own sigma as well.
+    assert rows["kinect_one"]["5cm"].mean > 2 * rows[str(judge)]["5cm"].mean
+    assert rows[str(judge)]["noisy, sensor"].mean == pytest.approx(0.87, abs=0.05)
+
+
 def test_a_limit_is_the_number_of_views(data: Path, tmp_path: Path) -> None:
     (table,), _ = run_table3(experiment(data, tmp_path, voxel_sizes=(0.2,), limit=3))
     assert any("2 keyframes, 1 held-out frames" in note for note in table.notes)

@@ -309,6 +309,29 @@ def test_a_scan_for_which_there_are_no_bricks_lets_no_time_pass(monkeypatch: pyt
         np.testing.assert_array_equal(now, then)
 
 
+def test_with_a_half_life_the_order_in_which_scans_come_does_not_matter() -> None:
+    """A box that was there first and is gone later is gone, whichever scan comes late."""
+    near, far = (np.full(CAMERA.shape, depth_m, np.float32) for depth_m in (1.02, 2.02))
+    scans = [(near, 0.0), (near, 1.0), (far, 20.0), (far, 21.0)]
+    found = []
+    for order in ((0, 1, 2, 3), (2, 3, 0, 1), (3, 0, 2, 1)):
+        m = LogOddsMap(0.05, time=TimeConfig(half_life_s=5.0))
+        for i in order:
+            m.add_keyframe(scans[i][0], np.eye(4), CAMERA, f"{i}", scans[i][1])
+        assert m.stale == (order != (0, 1, 2, 3))
+        m.infer()
+        assert not m.stale
+        found.append(m.voxels(0.0))
+    assert m.state(np.array([[0.02, 0.02, 1.02], [0.02, 0.02, 2.02]])).tolist() == [FREE, OCCUPIED]
+    for other in found[1:]:
+        for now, then in zip(other, found[0], strict=True):
+            np.testing.assert_array_equal(now, then)
+    static = LogOddsMap(0.05)
+    for i in (2, 3, 0, 1):
+        static.add_keyframe(scans[i][0], np.eye(4), CAMERA, f"{i}", scans[i][1])
+    assert not static.stale
+
+
 def octomap_voxels(
     frames: list[Frame], voxel_size: float, *, max_range: float = 0.0, discretise: bool = False
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -31,6 +31,9 @@ FLOOR, FAR_WALL = 0.03, -2.57
 """z of the floor, and x of the wall outside the volume of Table I. No surface of the room lies in a plane
 between voxels of a round size, where rounding would decide which of two it is in."""
 
+TOO_FAR = 0.5
+"""Metres by which the measurements of Redwood's layout are off: they cannot be taken for clean depth."""
+
 EMPTY = 3
 """Row of the clean coffin depth that holds NaN, as the sky does in the real one."""
 
@@ -126,6 +129,23 @@ def _kitchen(folder: Path) -> None:
         _write_depth(Path(f"{stem}.depth.png"), simulate(depth, CAMERA, KINECT_1, seed=index), 1000)
         np.savetxt(f"{stem}.pose.txt", pose)
     _write_camera(folder)
+
+
+def make_redwood(folder: Path) -> Path:
+    """The house in the layout of Redwood's livingroom1, in millimetres, with measurements that are TOO_FAR;
+    returns the folder. Taichi has to run."""
+    T_world_camera = poses(HOUSE_VIEWS, 0.3)
+    for name in ("depth", "depth_noisy"):
+        (folder / name).mkdir(parents=True)
+    log = []
+    for index, (pose, depth) in enumerate(zip(T_world_camera, clean_depth(T_world_camera), strict=True)):
+        _write_depth(folder / "depth" / f"{index:05d}.png", depth, 1000)
+        _write_depth(folder / "depth_noisy" / f"{index:05d}.png", depth + TOO_FAR, 1000)
+        log += [f"{index} {index} {index + 1}", *(" ".join(f"{x:.8f}" for x in row) for row in pose)]
+    (folder / "livingroom1-traj.txt").write_text("\n".join(log) + "\n")
+    (folder / "dist-model.txt").write_text("% a model of the noise\n" + "1.5\n" * 40)
+    _write_camera(folder)
+    return folder
 
 
 def _write_depth(path: Path, depth_m: np.ndarray, steps_per_metre: float) -> None:

@@ -65,15 +65,16 @@ class Eval:
     """
 
     experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
-    """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
-    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates (Dhiman et al. 2014),
-    peers, which compares all mappers that are installed, or all."""
+    """table1, table2, table3 and fig7 to fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker
+    and Zell 2014, exact, which compares MRFMap with the factor graph that it approximates (Dhiman et al.
+    2014), peers, which compares all mappers that are installed, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""
 
     data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
-    """Folder with the scenes, as data/README.md describes them."""
+    """Folder with the scenes, as data/README.md describes them; of table2 also a room of Redwood's, such as
+    livingroom1/."""
 
     voxel_sizes: tuple[float, ...] = ()
     """Voxel sizes in metres, instead of the experiment's own."""
@@ -86,6 +87,10 @@ class Eval:
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
     """Run only these parts of the experiment peers, such as 'kitchen*'."""
+
+    judge: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None
+    """table3: map the house by a simulated RealSense D435, and judge by another sensor: its parameter file,
+    or kinect_one and the like."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

@@ -176,13 +176,19 @@ def _white(camera: PinholeCamera) -> NDArray[np.uint8]:
 def perspective(room: DrawnMap) -> "Figure":
     """The voxels by height, seen from outside through what would be in the way."""
     pose = overview_pose(room.centres, room.normals, room.up, PERSPECTIVE, room.voxel_size)
+    colors, height_range = height_colors(room.centres @ room.up, room.voxel_size)
+    picture = voxels_from(room, pose, colors)
+    return overview(picture, f"{_voxels(room)}, surfaces that face away left out", height_range)
+
+
+def voxels_from(room: DrawnMap, pose: Pose, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Picture (H, W, 3), RGB, OVERSAMPLING times as large as PERSPECTIVE's, of the voxels in their ``colors``
+    (N, 3) as seen from a pose (4, 4) T_world_camera, without what faces away."""
     front = faces_viewer(room.centres, room.normals, pose[:3, 3])
     camera = PERSPECTIVE.scaled(OVERSAMPLING)
     image = cast_voxels(room.centres[front], room.voxel_size, camera, pose)
-    colors, height_range = height_colors(room.centres @ room.up, room.voxel_size)
     light = pose[:3, :3] @ LIGHT
-    picture = shaded(image, colors[front], room.normals[front], light, backdrop(camera.shape))
-    return overview(picture, f"{_voxels(room)}, surfaces that face away left out", height_range)
+    return shaded(image, colors[front], room.normals[front], light, backdrop(camera.shape))
 
 
 def _voxels(room: DrawnMap) -> str:
