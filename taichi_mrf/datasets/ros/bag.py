@@ -31,8 +31,9 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.poses import PoseChoice, pose_candidates
-from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader, Topic
+from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import BagCameras, find_cameras, find_sensor, posed_by, poses_of, track_of
+from taichi_mrf.datasets.ros.sources import Entry, Topic
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,

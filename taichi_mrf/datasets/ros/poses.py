@@ -22,8 +22,8 @@ from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
@@ -81,7 +81,7 @@ class BagPoses:
     assumed: bool = False
 
 
-def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
+def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:
     """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree; without
     topics also if transforms that may move do not. Raises DatasetError if there are none because publishers
     disagree."""
@@ -101,7 +101,7 @@ def _is_apart(topic: str, tree: TransformTree) -> bool:
 
 
 def find_poses(
-    reader: RosReader,
+    reader: TopicSource,
     frame: str,
     choice: PoseChoice,
     read: Callable[[], TransformTree],
@@ -144,7 +144,7 @@ def find_poses(
     return _from_topic(reader, name, tree, optical, choice, run or BagRun())
 
 
-def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
+def _from_tree(reader: TopicSource, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
     if optical not in tree.frames:
         raise _unknown_frame(reader, tree, optical)
     if not choice.frame:
@@ -164,7 +164,7 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
 
 
 def _of_body(
-    reader: RosReader, tree: TransformTree, fixed: str, below: list[str], choice: PoseChoice
+    reader: TopicSource, tree: TransformTree, fixed: str, below: list[str], choice: PoseChoice
 ) -> BagPoses:
     """The poses of a body of the tree, from whose place the data were moved to the ``fixed`` frame. Raises
     DatasetError if several may be it."""
@@ -184,7 +184,7 @@ def _of_body(
 
 
 def _from_topic(
-    reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
+    reader: TopicSource, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
 ) -> BagPoses:
     timed, parent, child, notes = _read_poses(reader, name, choice, run)
     tree = tree.towards(choice.body or child, named=False)
@@ -216,7 +216,7 @@ def _from_topic(
 
 
 def _read_poses(
-    reader: RosReader, name: str, choice: PoseChoice, run: BagRun
+    reader: TopicSource, name: str, choice: PoseChoice, run: BagRun
 ) -> tuple[TimedPoses, str, str, list[str]]:
     """A topic's poses, the frame that they are in, the frame that they are of (empty if not given), and
     notes. Raises DatasetError if they are of several bodies."""
@@ -266,7 +266,7 @@ def _read_poses(
     return TimedPoses(stamps, poses), parent, child, notes
 
 
-def _of_path(reader: RosReader, name: str) -> Iterator[tuple[Entry, Any]]:
+def _of_path(reader: TopicSource, name: str) -> Iterator[tuple[Entry, Any]]:
     """The poses of the last message of a Path, which has all of them."""
     for entry, message in deque(reader.messages(name), maxlen=1):
         for i, each in enumerate(message.poses):
@@ -360,7 +360,7 @@ def _is_cameras(frame: str) -> bool:
     return ("cam" in name or "optical" in name) and not is_body
 
 
-def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
+def must_connect(reader: TopicSource, tree: TransformTree, a: str, b: str) -> None:
     """Raise DatasetError, which lists the frames, unless the tree connects two frames."""
     for frame in (a, b):
         if a != b and frame not in tree.frames:
@@ -371,7 +371,7 @@ def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None
         raise DatasetError(f"{reader.path}: tf does not connect {a} and {b}")
 
 
-def _unknown_frame(reader: RosReader, tree: TransformTree, frame: str) -> DatasetError:
+def _unknown_frame(reader: TopicSource, tree: TransformTree, frame: str) -> DatasetError:
     known = ", ".join(tree.frames) or "none"
     return DatasetError(f"{reader.path}: tf has no frame '{frame}'; its frames: {known}")
 

@@ -15,8 +15,8 @@ from taichi_mrf.datasets.base import StampedPoses
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose
@@ -31,7 +31,7 @@ class BagSensor:
     """The messages of a topic, ``what``, that are of one run, by their stamps. ``frame`` is the sensor's, by
     the user's word or the first message; ``tree`` reads its tree of frames."""
 
-    reader: RosReader
+    reader: TopicSource
     topic: str
     what: str
     frame: str
@@ -46,7 +46,7 @@ class BagSensor:
         return Counter(entry.frame for entry in self.entries)
 
 
-def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) -> BagSensor:
+def find_sensor(reader: TopicSource, topic: str, what: str, choice: PoseChoice) -> BagSensor:
     """The messages of a topic that are read. Raises DatasetError, naming file and topic, if there is none, or
     no run that the user wants, or if they are of several frames and of none that the user named."""
     recorded, said = stamped(reader, topic, what)
@@ -73,7 +73,7 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
     )
 
 
-def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
+def _tree(reader: TopicSource, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
     try:
         return tree_of(read_transforms(reader), topic, frame, tf, run)
     except DatasetError as error:
@@ -100,7 +100,7 @@ def poses_of(sensor: BagSensor, choice: PoseChoice) -> dict[str, BagPoses]:
     return found
 
 
-def _several(reader: RosReader, topic: str, what: str, frames: Mapping[str, int]) -> str:
+def _several(reader: TopicSource, topic: str, what: str, frames: Mapping[str, int]) -> str:
     words = ", ".join(f"{frame or 'unnamed'} ({count})" for frame, count in frames.items())
     return f"{reader.path}: topic {topic} has {what} of several frames, {words}, as of several sensors"
 
@@ -238,7 +238,13 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
 
 
 def _frame_of_info(
-    reader: RosReader, depth: DepthTopic, name: str, frame: str, known: list[str], wanted: bool, several: bool
+    reader: TopicSource,
+    depth: DepthTopic,
+    name: str,
+    frame: str,
+    known: list[str],
+    wanted: bool,
+    several: bool,
 ) -> str:
     """The frame of the CameraInfo of images in a frame. Raises DatasetError if there is none."""
     if frame in known:
@@ -275,7 +281,7 @@ def _half_a_frame(entries: Sequence[Entry]) -> float:
 
 
 def _fitted(
-    reader: RosReader, depth: DepthTopic, name: str, entries: Sequence[Entry], cameras: BagCameras
+    reader: TopicSource, depth: DepthTopic, name: str, entries: Sequence[Entry], cameras: BagCameras
 ) -> BagCameras:
     """The cameras with the first one as it fits its images, and a note if they are of another size than its
     CameraInfo. Raises DatasetError if none of the first images fits."""
@@ -300,7 +306,7 @@ def _fitted(
     return cameras
 
 
-def _first_size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
+def _first_size(reader: TopicSource, depth: DepthTopic) -> tuple[int, int]:
     """(width, height) of a topic's first image."""
     with naming(f"{reader.path}: topic {depth.name}"):
         height, width = messages.depth_image(reader.first(depth.name), None).shape

@@ -16,8 +16,8 @@ import numpy as np
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.sources import TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -248,7 +248,7 @@ def tree_of(
     return TransformTree(edges, disputed, apart)
 
 
-def read_transforms(reader: RosReader) -> dict[str, Transforms]:
+def read_transforms(reader: TopicSource) -> dict[str, Transforms]:
     """Transforms that were sent in each namespace."""
     sent: dict[str, dict[str, list[tuple[_Sent, float]]]] = {}
     for topic in reader.topics.values():
