@@ -35,6 +35,7 @@ class Robot:
     bag: Path
     port: int
     listener: Listener = field(default_factory=Listener)
+    sent: int = 0
 
     def __post_init__(self) -> None:
         self.context = foxglove.Context()
@@ -74,6 +75,12 @@ class Robot:
         for topic, time, data in self.messages:
             if not topics or topic in topics:
                 self.channels[topic].log(data, log_time=time)
+
+    def send_next(self, count: int) -> None:
+        """Send the next messages in the order of recording, as many as there are."""
+        for topic, time, data in self.messages[self.sent : self.sent + count]:
+            self.channels[topic].log(data, log_time=time)
+        self.sent += count
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.runs import BagRun
-from taichi_mrf.datasets.ros.sources import Entry, TopicSource
+from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
@@ -36,6 +36,10 @@ NO_POSES = (
     "lines of stamp tx ty tz qx qy qz qw from a tracker or SLAM, or ?poses=track, which finds them from the "
     "images"
 )
+
+
+KEPT_S = 30.0
+"""Poses of a robot that runs are kept for so many seconds."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class BagPoses:
     """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
     poses and the time that they span, ``stamps`` are theirs, if known. ``registered``: the sensor's data are
     not in its own frame but in the fixed one, where an odometry has put them. ``assumed``: nothing says that
-    the poses are of the sensor's own axes."""
+    the poses are of the sensor's own axes. ``hear`` takes a message of a robot that runs, on a topic;
+    ``moving`` are the poses that ``at`` interpolates."""
 
     at: Callable[[float, float], Pose | None]
     source: str
@@ -79,6 +84,15 @@ class BagPoses:
     registered: bool = False
     stamps: Sequence[float] | NDArray[np.float64] = ()
     assumed: bool = False
+    hear: Callable[[Topic, Entry, Any], None] = lambda topic, entry, message: None
+    moving: Sequence[TimedPoses] = ()
+
+    @property
+    def until(self) -> float:
+        """The time in seconds up to which poses are known: later ones have yet to come. A transform that came
+        once, beside others that come again, does not move."""
+        again = [each for each in self.moving if len(each) > 1] or self.moving
+        return min((float(each.stamps[-1]) for each in again), default=math.inf)
 
 
 def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:
@@ -152,14 +166,22 @@ def _from_tree(reader: TopicSource, tree: TransformTree, optical: str, choice: P
     fixed = choice.frame or tree.ancestors(optical)[-1]
     must_connect(reader, tree, fixed, optical)
     note = f"poses in {fixed} from tf, of {optical}"
-    moving = [edge.stamps for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
-    first, last = (max(s[0] for s in moving), min(s[-1] for s in moving)) if moving else (0.0, float("inf"))
+    moving = [edge for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
+    first = max((each.stamps[0] for each in moving), default=0.0)
+    last = min((each.stamps[-1] for each in moving), default=math.inf)
     span = f"{first:.3f} to {last:.3f} s"
+
+    def hear(topic: Topic, entry: Entry, message: Any) -> None:
+        if topic.type in messages.TF:
+            tree.hear(topic.name, entry, message, KEPT_S)
+
     return BagPoses(
         lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
         f"tf from {fixed} to {optical}: {span}",
         [note],
-        stamps=max(moving, key=len, default=()),
+        stamps=max((each.stamps for each in moving), key=len, default=()),
+        hear=hear,
+        moving=moving,
     )
 
 
@@ -209,10 +231,39 @@ def _from_topic(
         known = [step for step in steps if step is not None]
         return None if len(known) < len(steps) else reduce(np.matmul, known)
 
+    def hear(topic: Topic, entry: Entry, message: Any) -> None:
+        if topic.type in messages.TF:
+            tree.hear(topic.name, entry, message, KEPT_S)
+        elif topic.name == name and _is_of(entry, message, parent, child):
+            pose = _valid_pose(message)
+            if pose is not None:
+                timed.add(entry.stamp, pose, KEPT_S)
+
     source = f"{name}: {_span(timed)}"
     if registered:
         return BagPoses(at, source, notes, registered=True)
-    return BagPoses(at, source, notes, stamps=timed.stamps, assumed=body == optical and child != optical)
+    steps = [*tree.between(fixed, parent), *tree.between(body, optical)]
+    return BagPoses(
+        at,
+        source,
+        notes,
+        stamps=timed.stamps,
+        assumed=body == optical and child != optical,
+        hear=hear,
+        moving=[timed, *(step for step in steps if isinstance(step, TimedPoses))],
+    )
+
+
+def _is_of(entry: Entry, message: Any, parent: str, child: str) -> bool:
+    """True if a pose is of a body in a frame, or does not say otherwise."""
+    return entry.frame in ("", parent) and frame_name(getattr(message, "child_frame_id", "")) in ("", child)
+
+
+def _valid_pose(message: Any) -> Pose | None:
+    try:
+        return as_pose(messages.pose_of(message))
+    except KeyframeError:
+        return None
 
 
 def _read_poses(
@@ -229,9 +280,8 @@ def _read_poses(
     broken = 0
     unstamped: set[Entry] = set()
     for entry, message in _of_path(reader, name) if topic.type == messages.PATH else reader.messages(name):
-        try:
-            pose = as_pose(messages.pose_of(message))
-        except KeyframeError:
+        pose = _valid_pose(message)
+        if pose is None:
             broken += 1
             continue
         child = frame_name(getattr(message, "child_frame_id", ""))

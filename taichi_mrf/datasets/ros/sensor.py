@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,22 @@ from taichi_mrf.datasets.ros.runs import BagRun, run_of
 from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, choose_depth
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
 from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
+
+
+@dataclass(frozen=True)
+class DepthChoice(PoseChoice):
+    """How the images of depth and their poses are chosen."""
+
+    depth: str = ""
+    """The topic of depth images."""
+
+    info: str = ""
+    """The topic of their CameraInfo."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +151,31 @@ def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[]
     return read
 
 
+class DepthCamera(NamedTuple):
+    """What is mapped: a topic of depth images, its messages, the cameras that took them, and their poses by
+    the frames of the images."""
+
+    depth: DepthTopic
+    sensor: BagSensor
+    cameras: "BagCameras"
+    poses: dict[str, BagPoses]
+
+
+def find_depth_camera(reader: TopicSource, choice: DepthChoice, options: ReadOptions) -> DepthCamera:
+    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
+    text names the source and lists the candidates."""
+    depth = choose_depth(reader, choice.depth)
+    sensor = find_sensor(reader, depth.name, "images", choice)
+    cameras = find_cameras(sensor, depth, choice.info, options)
+    found = poses_of(sensor, choice)
+    if any(each.registered for each in found.values()):
+        raise DatasetError(
+            f"{reader.path}: the images of {depth.name} say that they are in {depth.frame}, the frame that "
+            "the poses are in: ?optical=FRAME names the camera's own"
+        )
+    return DepthCamera(depth, sensor, cameras, found)
+
+
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
 
 _LOOKED_AT = 5
@@ -182,6 +218,21 @@ class BagCameras:
         begin = [since for since, _ in stated]
         camera = stated[max(0, bisect_right(begin, entry.stamp) - 1)][1]
         return (camera.of(shape) if shape is not None else None) or camera.cut
+
+    def measured(
+        self, message: Any, entry: Entry, depth_scale: float | None, where: str
+    ) -> tuple[NDArray[np.float32], PinholeCamera]:
+        """The depths (H, W) of an image in metres, and the camera that took it. Raises DatasetError, which
+        begins with ``where``, if it is no depth or not of its camera's size."""
+        with naming(where):
+            depth_m = messages.depth_image(message, depth_scale)
+        camera = self.at(entry, depth_m.shape)
+        if depth_m.shape != camera.shape:
+            raise DatasetError(
+                f"{where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
+                f"the camera {camera.width} x {camera.height}"
+            )
+        return depth_m, camera
 
 
 def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.sources import TopicSource
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, naming
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 FROM_TF = "tf"
@@ -135,3 +135,18 @@ def choose(reader: TopicSource, option: str, wanted: str, candidates: Sequence[s
         raise DatasetError(f"{path}: contains no {what}; its topics: {topics}")
     choices = ", ".join(f"{option}={name}" for name in candidates)
     raise DatasetError(f"{path}: contains several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
+
+
+def choose_depth(reader: TopicSource, wanted: str) -> DepthTopic:
+    """The topic of depth images that the user named, or the only one. Raises DatasetError, as choose, and if
+    its images are no depth that can be read."""
+    topics = {topic.name: topic for topic in depth_topics(reader)}
+    unread = [] if topics else packed_otherwise(reader)
+    if not (topics or unread or wanted):
+        raise DatasetError(f"{reader.path}: {no_depth(reader)}")
+    what = f"topics of depth images ({messages.ENCODINGS})"
+    name = choose(reader, "depth", wanted, [*topics, *unread], what)
+    topic = topics.get(name) or described(reader, name)
+    with naming(f"{reader.path}: topic {name}"):
+        messages.check_depth(topic.encoding)
+    return topic

@@ -127,7 +127,7 @@ class FoxgloveClient:
             raise DatasetError(f"{where} nobody listens there: start '{BRIDGE}' on the robot") from error
         except TimeoutError as error:
             raise DatasetError(
-                f"{where} no answer within {CONNECT_S:g} s: is the robot on, in this network, and the port open?"
+                f"{where} no answer within {CONNECT_S:g} s: is the robot on, in this network, its port open?"
             ) from error
         except socket.gaierror as error:
             host = urlsplit(self.address).hostname
