@@ -57,10 +57,18 @@ class Robot:
         return f"foxglove:ws://127.0.0.1:{self.port}"
 
     def start(self) -> None:
-        self.server = foxglove.start_server(
-            host="127.0.0.1", port=self.port, context=self.context, server_listener=self.listener
-        )
+        """Listen, at the same port as before once the system lets go of it."""
+        assert wait_until(self._starts, 20), f"port {self.port} is in use"
+
+    def _starts(self) -> bool:
+        try:
+            self.server = foxglove.start_server(
+                host="127.0.0.1", port=self.port, context=self.context, server_listener=self.listener
+            )
+        except RuntimeError:
+            return False
         self.port = self.server.port
+        return True
 
     def stop(self) -> None:
         self.server.stop()

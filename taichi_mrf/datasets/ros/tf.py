@@ -185,9 +185,9 @@ class TransformTree:
     def _chain(self, frames: list[str], stamp: float, largest_gap: float) -> Pose | None:
         T = np.eye(4)
         for frame in frames:
-            step, edge = self._holds(frame), self.edges[frame][1]
-            if step is None and isinstance(edge, TimedPoses):
-                step = edge.at(stamp, largest_gap)
+            edge = self.edges[frame][1]
+            step = edge.at(stamp, largest_gap) if isinstance(edge, TimedPoses) else edge
+            step = self._holds(frame) if step is None else step
             if step is None:
                 return None
             T = step @ T
