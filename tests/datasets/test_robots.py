@@ -14,6 +14,7 @@ from inputs_bags import (
     FRAME,
     TOPIC,
     Bag,
+    Kind,
     images,
     mounted,
     moving_tf,
@@ -49,8 +50,10 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
     monkeypatch.setattr(wired, "DECIDE_S", 0.3)
     with ExitStack() as stack:
 
-        def begin_one(*parts: Part, query: str = "", first: int = 1000) -> tuple[Robot, Dataset, Path]:
-            bag = write_bag(tmp_path, *parts, kind="mcap")
+        def begin_one(
+            *parts: Part, query: str = "", first: int = 1000, kind: Kind = "mcap"
+        ) -> tuple[Robot, Dataset, Path]:
+            bag = write_bag(tmp_path, *parts, kind=kind)
             sender = stack.enter_context(robot(bag))
 
             def send() -> None:
@@ -110,6 +113,14 @@ def test_frames_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str, way: s
         assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
         np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def test_ros_1_is_read_too(begin: Begin) -> None:
+    _, live, bag = begin(plain, kind="ros1")
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    ours, theirs = live.read(0), open_dataset(bag, color=False).read(COUNT - 1)
+    np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+    np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
 
 
 def came(live: Dataset) -> int:

@@ -1,4 +1,4 @@
-"""A robot that runs: a server of Foxglove's own library that sends the messages of a bag of ROS 2."""
+"""A robot that runs: a server of Foxglove's own library that sends the messages of a bag."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,11 +43,13 @@ class Robot:
         self.channels: dict[str, Any] = {}
         with AnyReader([self.bag]) as reader:
             for each in reader.connections:
-                schema = foxglove.Schema(
-                    name=each.msgtype, encoding="ros2msg", data=each.msgdef.data.encode()
-                )
+                name, text = each.msgtype, each.msgdef.data.encode()
+                if not reader.is2:
+                    name = name.replace("/msg/", "/")
+                kind, encoding = ("ros2msg", "cdr") if reader.is2 else ("ros1msg", "ros1")
+                schema = foxglove.Schema(name=name, encoding=kind, data=text)
                 self.channels[each.topic] = foxglove.Channel(
-                    each.topic, schema=schema, message_encoding="cdr", context=self.context
+                    each.topic, schema=schema, message_encoding=encoding, context=self.context
                 )
             self.messages = [(each.topic, time, bytes(data)) for each, time, data in reader.messages()]
         self.start()

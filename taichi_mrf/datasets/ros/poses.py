@@ -38,7 +38,7 @@ NO_POSES = (
 )
 
 
-KEPT_S = 30.0
+KEPT_S = 10.0
 """Poses of a robot that runs are kept for so many seconds."""
 
 
@@ -173,7 +173,7 @@ def _from_tree(reader: TopicSource, tree: TransformTree, optical: str, choice: P
 
     def hear(topic: Topic, entry: Entry, message: Any) -> None:
         if topic.type in messages.TF:
-            tree.hear(topic.name, entry, message, KEPT_S)
+            tree.hear(topic.name, entry, message, moving, KEPT_S)
 
     return BagPoses(
         lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
@@ -231,9 +231,14 @@ def _from_topic(
         known = [step for step in steps if step is not None]
         return None if len(known) < len(steps) else reduce(np.matmul, known)
 
+    moving = [timed]
+    if not registered:
+        steps = [*tree.between(fixed, parent), *tree.between(body, optical)]
+        moving += [step for step in steps if isinstance(step, TimedPoses)]
+
     def hear(topic: Topic, entry: Entry, message: Any) -> None:
         if topic.type in messages.TF:
-            tree.hear(topic.name, entry, message, KEPT_S)
+            tree.hear(topic.name, entry, message, moving, KEPT_S)
         elif topic.name == name and _is_of(entry, message, parent, child):
             pose = _valid_pose(message)
             if pose is not None:
@@ -242,7 +247,6 @@ def _from_topic(
     source = f"{name}: {_span(timed)}"
     if registered:
         return BagPoses(at, source, notes, registered=True)
-    steps = [*tree.between(fixed, parent), *tree.between(body, optical)]
     return BagPoses(
         at,
         source,
@@ -250,7 +254,7 @@ def _from_topic(
         stamps=timed.stamps,
         assumed=body == optical and child != optical,
         hear=hear,
-        moving=[timed, *(step for step in steps if isinstance(step, TimedPoses))],
+        moving=moving,
     )
 
 

@@ -9,7 +9,7 @@ frame, or about its parent, leave it disputed; what passes through it asks the u
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,15 +56,18 @@ class TransformTree:
         self.apart = tuple(apart)
         self._held: dict[str, Pose | None] = {}
 
-    def hear(self, topic: str, entry: Entry, message: Any, keep_s: float) -> None:
-        """Take the transforms of a message that has just come for those of moving frames of this tree, and
-        keep those of the last ``keep_s`` seconds."""
+    def hear(
+        self, topic: str, entry: Entry, message: Any, moving: Collection[TimedPoses], keep_s: float
+    ) -> None:
+        """Add the transforms of a message that has just come to those of this tree's that are ``moving``, of
+        which the last ``keep_s`` seconds are kept."""
         if namespace(topic) in self.apart:
             return
         for child, row in _sent_in(topic, entry, message):
             parent, edge = self.edges.get(child, ("", None))
-            if parent == row.parent and isinstance(edge, TimedPoses) and np.isfinite(row.pose).all():
-                edge.add(row.stamp or entry.stamp, row.pose, keep_s)
+            found = next((each for each in moving if each is edge), None)
+            if found is not None and parent == row.parent and np.isfinite(row.pose).all():
+                found.add(row.stamp or entry.stamp, row.pose, keep_s)
                 self._held.clear()
 
     def towards(self, *frames: str, named: bool = True) -> "TransformTree":

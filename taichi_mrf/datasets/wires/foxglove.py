@@ -131,9 +131,7 @@ class FoxgloveClient:
             ) from error
         except socket.gaierror as error:
             host = urlsplit(self.address).hostname
-            raise DatasetError(
-                f"{where} no machine has the name {host}: its IP address works, too"
-            ) from error
+            raise DatasetError(f"{where} no machine is called {host}: try its IP address") from error
         except (InvalidHandshake, EOFError) as error:
             raise DatasetError(f"{where} {_another(said(error))}") from error
         except (OSError, InvalidURI, ValueError) as error:
