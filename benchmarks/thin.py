@@ -20,10 +20,11 @@ import yaml
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks.lab.early import too_early
 from benchmarks.thin_paths import BALL_M, Crossing, crossings
 from benchmarks.thin_rooms import SCENES, Scene, Sensor, View, depth_camera, spinning_lidar, take_views
 from benchmarks.thin_shapes import Array, voxels_of
-from taichi_mrf import FREE, OCCUPIED, UNKNOWN, cast_rays
+from taichi_mrf import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Arch, Config, SensorConfig
 from taichi_mrf.config.values import from_dict
@@ -31,6 +32,7 @@ from taichi_mrf.datasets.lidar.scans import LIDAR_PASS_THROUGH
 from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 
 LEAST_ENDS = 10
@@ -38,9 +40,6 @@ LEAST_ENDS = 10
 
 TOLERANCE = 1.5
 """Voxels by which a rendered depth may be off."""
-
-BLOCKED_SIGMAS = 3.0
-"""Standard deviations, and a voxel, in front of a measurement: an occupied voxel there blocks its ray."""
 
 _OFFSET = 1 << 20
 
@@ -54,6 +53,9 @@ class Options:
 
     sensor: Annotated[str, tyro.conf.arg(metavar="camera|lidar")] = "camera"
     """A depth camera of 320 x 240, or a lidar of 16 rings (32 in the yard)."""
+
+    width: int = 320
+    """Pixels of a depth camera's row; its columns have three quarters as many."""
 
     voxel_size: tuple[float, ...] = (0.05,)
     """Metres."""
@@ -290,14 +292,8 @@ def _held_out_pixels(m: OccupancyMap, scene: Scene, sensor: Sensor, views: list[
 
 
 def _blocked(m: OccupancyMap, sensor: Sensor, views: list[View]) -> float:
-    blocked = []
-    for view in views:
-        seen = view.depth_m > 0
-        rays = sensor.camera.rays()[seen] @ view.T_world_camera[:3, :3].T
-        length, measured_m = np.linalg.norm(rays, axis=1), view.depth_m[seen].astype(float)
-        hits = cast_rays(m, view.T_world_camera[:3, 3], rays, float((measured_m * length).max()))
-        before_m = BLOCKED_SIGMAS * sensor.sigma_at(measured_m) + m.voxel_size
-        blocked.append(hits.hit & (hits.range / length < measured_m - before_m))
+    frames = [Frame(view.depth_m, view.T_world_camera, sensor.camera, 0.0, "held out") for view in views]
+    blocked = [too_early(m, frame, sensor.sigma_at(frame.depth_m.astype(float)))[0] for frame in frames]
     return _mean(np.concatenate(blocked))
 
 
@@ -337,7 +333,11 @@ def main() -> None:
     for name in rooms:
         scene = SCENES[name](options.seed)
         kinect = SensorConfig()
-        sensor = spinning_lidar(name == "yard") if lidar else depth_camera(kinect.sigma, kinect.max_depth)
+        sensor = (
+            spinning_lidar(name == "yard")
+            if lidar
+            else depth_camera(kinect.sigma, kinect.max_depth, options.width)
+        )
         views = take_views(scene, sensor, options.views + options.held_out, options.seed)
         out = set(np.linspace(0, len(views) - 1, options.held_out + 2).astype(int)[1:-1].tolist())
         mapped, held_out = (

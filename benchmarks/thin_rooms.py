@@ -117,9 +117,12 @@ class View:
         return ends @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
-def depth_camera(sigma: tuple[float, ...], max_depth: float) -> Sensor:
-    """A Kinect at half its resolution."""
-    return Sensor(PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5), sigma, max_depth)
+def depth_camera(sigma: tuple[float, ...], max_depth: float, width: int = 320) -> Sensor:
+    """A Kinect, which has a width of 640 pixels, by default at half its resolution."""
+    height, focal = width * 3 // 4, 525.0 / 640 * width
+    return Sensor(
+        PinholeCamera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), sigma, max_depth
+    )
 
 
 def spinning_lidar(yard: bool) -> Sensor:

@@ -3,7 +3,8 @@
 Maps are calibrated by every fifth view (every third of the coffin scene's twelve), which they have not seen,
 and compared with the truth: a voxel contains matter if a surface passes through it and a clean ray ends
 there, and is free if a clean ray crosses it and no surface touches it. The room with thin things is that of
-thin.py.
+thin.py. Of recordings nothing is known but the bounds that they lead to: the lowest of all scenes are the
+default table of queries/free.py.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,12 +24,22 @@ from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.evaluation.free_space import calibrate_free
 from taichi_mrf.evaluation.occupancy_truth import SeenVoxels, occupancy_truth, seen_voxels
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import mrf
+from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
 from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.scenes import OFF_THE_GRID_M, Scene, SceneView, coffin_scene, house_scene, turned
+from taichi_mrf.experiments.scenes import (
+    Scene,
+    SceneView,
+    coffin_scene,
+    house_scene,
+    kitchen_scene,
+    lidar_scene,
+    off_the_grid,
+    turned,
+)
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.queries.free import FreePromise, states_at
+from taichi_mrf.queries.free import LEVELS as ALL_LEVELS
+from taichi_mrf.queries.free import NEVER, FreePromise, states_at
 from taichi_mrf.queries.known_bricks import known_bricks
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.camera import pinhole
@@ -55,16 +66,20 @@ class Truth:
 
 
 def run_promise(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """Coverage and cost of each scene and voxel size."""
+    """Coverage and cost of each scene and voxel size, and the bounds."""
     rows: list[list[Entry]] = []
+    bounds: list[list[Entry]] = []
     for size in experiment.voxel_sizes:
-        for name, make in _places(experiment).items():
+        places = {name: make for name, make in _places(experiment).items() if experiment.wants(name)}
+        for number, (name, make) in enumerate(places.items()):
+            experiment.report(f"{name}, {100 * size:g} cm", number, len(places))
             m, frames, truth = make(size)
             promise = calibrate_free(m, frames)
-            if promise is not None:
+            if promise is None:
+                continue
+            bounds.append([name, f"{100 * size:g} cm", *promise.bound.tolist()])
+            if truth is not None:
                 rows += [[name, f"{100 * size:g} cm", *row] for row in _judge(m, promise, truth)]
-                print(*(" ".join(map(str, row)) for row in rows[-len(LEVELS) :]), sep="\n", flush=True)
-                print("bounds", np.round(promise.bound, 3).tolist(), flush=True)
     columns = ["scene", "voxels", "level", "bound", "free without matter", "least sure without matter",
                "held, worst", "held, best", "truly free refused", "clearance lost, cm"]  # fmt: skip
     notes = [
@@ -74,19 +89,29 @@ def run_promise(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         "occupied voxel less that to the nearest one that is occupied or refused, of voxels up to "
         f"{NEAR_M:g} m from the former.",
     ]
-    table = Table("promise", "Free space with a promise", columns, rows, notes)
-    return [table], write_table(experiment.out, table)
+    tables = [
+        Table("promise", "Free space with a promise", columns, rows, notes),
+        Table("bounds", "Bounds of levels, nats",
+              ["scene", "voxels", *(f"{100 * level:g}%" for level in ALL_LEVELS)], bounds,
+              [f"A level that cannot be promised has {NEVER:g}."]),
+    ]  # fmt: skip
+    return tables, [path for table in tables for path in write_table(experiment.out, table)]
 
 
-def _places(experiment: Experiment) -> dict[str, Callable[[float], tuple[OccupancyMap, list[Frame], Truth]]]:
+def _places(
+    experiment: Experiment,
+) -> dict[str, Callable[[float], tuple[OccupancyMap, list[Frame], Truth | None]]]:
     seed = experiment.seeds[0]
     house, room = _house(experiment), _room(experiment, frames=50)
     whole = house_scene(experiment.data, seed)
-    places = {
+    kitchen, building = kitchen_scene(experiment.data), lidar_scene(experiment.data)
+    places: dict[str, Callable[[float], tuple[OccupancyMap, list[Frame], Truth | None]]] = {
         "house, turned": lambda size: _by_mesh(*turned(whole, house.mesh), size),
         "room": lambda size: _by_mesh(room.scene, room.mesh, size),
         "room, turned": lambda size: _by_mesh(*turned(room.scene, room.mesh), size),
-        "coffin scene": lambda size: _coffin(coffin_scene(experiment.data, seed), size),
+        "coffin scene": lambda size: _coffin(off_the_grid(coffin_scene(experiment.data, seed)), size),
+        "kitchen": lambda size: (*_mapped(kitchen, 5, size), None),
+        "building by lidar": lambda size: (*_mapped(building, 5, size, lidar_mrf()), None),
     }
     for name in ("room", "fence", "clutter"):
         places[f"thin things: {name}"] = lambda size, name=name: _thin(name, seed, size)  # type: ignore[misc]
@@ -97,16 +122,18 @@ def _split(count: int, each: int) -> set[int]:
     return {i for i in range(count) if i % each == each // 2}
 
 
-def _mapped(scene: Scene, each: int, size: float) -> tuple[OccupancyMap, list[Frame]]:
+def _mapped(
+    scene: Scene, each: int, size: float, contender: Contender | None = None
+) -> tuple[OccupancyMap, list[Frame]]:
     out = _split(len(scene.views), each)
-    m = mrf().make(scene, size)
+    m = (contender or mrf()).make(scene, size)
     frames = []
     for i, view in enumerate(scene.views):
+        camera = view.camera or scene.camera
         if i in out:
-            stamp_s = float(i)
-            frames.append(Frame(view.measured_m, view.T_world_camera, scene.camera, stamp_s, view.name))
+            frames.append(Frame(view.measured_m, view.T_world_camera, camera, float(i), view.name))
         else:
-            m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
+            m.add_keyframe(view.measured_m, view.T_world_camera, camera, view.name)
     m.infer()
     return m, frames
 
@@ -119,20 +146,8 @@ def _by_mesh(scene: Scene, mesh: TriangleMesh, size: float) -> tuple[OccupancyMa
 
 def _coffin(scene: Scene, size: float) -> tuple[OccupancyMap, list[Frame], Truth]:
     """Without a mesh: matter is where clean rays end."""
-    views = [_moved(view) for view in scene.views]
-    lower, upper = (
-        np.asarray(corner) + OFF_THE_GRID_M for corner in (scene.volume.lower, scene.volume.upper)
-    )
-    volume = type(scene.volume)(lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
-    scene = Scene(scene.name, scene.camera, scene.noise, volume, scene.max_depth, views)
-    crossed, ended = _keys(seen_voxels(*_clean(views), scene.pinhole, size))
+    crossed, ended = _keys(seen_voxels(*_clean(scene.views), scene.pinhole, size))
     return *_mapped(scene, 3, size), Truth(ended, np.setdiff1d(crossed, ended))
-
-
-def _moved(view: SceneView) -> SceneView:
-    T = view.T_world_camera.copy()
-    T[:3, 3] += OFF_THE_GRID_M
-    return SceneView(view.name, T, view.measured_m, view.true_m, view.judged)
 
 
 def _thin(name: str, seed: int, size: float) -> tuple[OccupancyMap, list[Frame], Truth]:

@@ -163,6 +163,18 @@ def turned(scene: Scene, mesh: TriangleMesh) -> tuple[Scene, TriangleMesh]:
     return there, TriangleMesh(vertices, mesh.triangles)
 
 
+def off_the_grid(scene: Scene) -> Scene:
+    """A scene that fills its volume, moved by OFF_THE_GRID_M."""
+    there = np.eye(4)
+    there[:3, 3] = OFF_THE_GRID_M
+    views = [replace(view, T_world_camera=there @ view.T_world_camera) for view in scene.views]
+    lower, upper = (
+        tuple((np.asarray(corner) + OFF_THE_GRID_M).tolist())
+        for corner in (scene.volume.lower, scene.volume.upper)
+    )
+    return replace(scene, views=views, volume=VolumeConfig(lower=lower, upper=upper))
+
+
 def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]:
     """Indices of the views that the geometric heuristic of section V makes keyframes."""
     selector = KeyframeSelector(KeyframeConfig(rotation=rotation, translation=translation))

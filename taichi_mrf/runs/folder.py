@@ -19,7 +19,7 @@ from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.datasets.recorded_noise import some_depths
 from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
-from taichi_mrf.evaluation.free_space import calibrate_free, spread_frames
+from taichi_mrf.evaluation.free_space import MOST_FRAMES, calibrate_free, spread_frames
 from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out
 from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, check_noise, enough_of
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
@@ -281,11 +281,13 @@ def _check(
 def _calibrate(result: MappingResult, dataset: Dataset, advance: Advance) -> None:
     """Find what levels of free space mean in the finished map, before it is written."""
     m = result.map
-    if not m.settled or result.interrupted or window_of(m) is not None or not result.held_out:
+    if not m.settled or result.interrupted or not result.held_out:
         return
+    # A window is where the camera was last.
+    held_out = result.held_out if window_of(m) is None else result.held_out[-MOST_FRAMES:]
     advance("Free space", 0, 1)
     with result.timed("checking"):
-        m.promise = calibrate_free(m, _readable(dataset, spread_frames(result.held_out)))
+        m.promise = calibrate_free(m, _readable(dataset, spread_frames(held_out)))
     advance("Free space", 1, 1)
 
 

@@ -33,6 +33,8 @@ def test_a_run_with_a_window_leaves_the_whole_map_in_chunks(tmp_path: Path) -> N
     assert report["accuracy"]["frames"] == 6
     assert report["accuracy"]["median_abs"] < 0.1
     assert "map_window.zarr holds its" in " ".join(report["notes"])
+    # What free means is found by the held-out frames that see into the window.
+    assert 3 <= report["free_space"]["blocks"] <= 6
     assert {path.name for path in tmp_path.iterdir()} == {
         "map.npz", "map_window.zarr", "voxels.ply", "config.yaml", "report.json",
     }  # fmt: skip
@@ -40,6 +42,7 @@ def test_a_run_with_a_window_leaves_the_whole_map_in_chunks(tmp_path: Path) -> N
     centres, _ = whole.voxels(min_probability=0.5)
     assert f"element vertex {len(centres)}" in (tmp_path / "voxels.ply").read_bytes()[:300].decode()
     assert (near.state(centres) == UNKNOWN).mean() > 0.2
+    assert near.promise.blocks == report["free_space"]["blocks"]
     # What is said and exported of the map's file is of the whole map too.
     info = taichi_mrf("info", tmp_path / "map.npz").stdout
     assert f"{len(near.window.parked)} chunks, in map_window.zarr" in info
