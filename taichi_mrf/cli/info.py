@@ -20,10 +20,10 @@ from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Arch, Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.entries import FOXGLOVE
 from taichi_mrf.datasets.recorded_noise import proposed_voxel_size
-from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
+from taichi_mrf.datasets.registry import format_name, is_rendered, topics_in
 from taichi_mrf.datasets.ros.bag import BagSummary
-from taichi_mrf.datasets.ros.bag import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import UNUSED_COLOR, note_unused_color, summarise
 from taichi_mrf.errors import DatasetError
@@ -82,9 +82,8 @@ def _backend_facts(arch: Arch) -> dict[str, Any]:
 def _source_facts(options: Info) -> dict[str, Any]:
     assert options.source is not None
     facts: dict[str, Any] = {"source": options.source}
-    path = bag_path(options.source)
-    if path is not None:
-        bag = summarise_bag(path)
+    bag = topics_in(options.source)
+    if bag is not None:
         facts["topics"] = [
             {"name": topic.name, "type": topic.type, "messages": topic.messages} for topic in bag.topics
         ]
@@ -136,9 +135,8 @@ def _print_backends(console: Terminal, arch: Arch) -> None:
 
 def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFlags) -> bool:
     """Print what is in a source; returns whether it can be mapped."""
-    path = bag_path(source)
-    if path is not None:
-        bag = summarise_bag(path)
+    bag = topics_in(source)
+    if bag is not None:
         _print_topics(console, bag)
     if is_rendered(source):
         runtime.init(arch)
@@ -146,11 +144,11 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
         dataset = open_dataset(source, color=False, **reading.keywords())
         note_unused_color(dataset, source, reading)
     except DatasetError as error:
-        if path is None:
+        if bag is None:
             raise
         console.print_line(f"It cannot be mapped like this: {error}")
         for name in bag.sources:
-            console.print_line(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
+            console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(FOXGLOVE)))
         return False
     usable = _print_frames(console, format_name(source), dataset)
     if usable:
@@ -161,9 +159,13 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
 def _map_command(source: str, dataset: Dataset, reading: SourceFlags) -> str:
     """The command that maps a source as it was read here, with what was found in it. Noise and reach that a
     recording states need no flag."""
-    words = ["taichi-mrf", "map", source, *reading.words()]
+    words = [source, *reading.words()]
     words += ["--color"] if UNUSED_COLOR in dataset.notes else []
-    return shlex.join([*words, "--out", "DIR"])
+    return _command(shlex.join(words), dataset.endless)
+
+
+def _command(words: str, endless: bool) -> str:
+    return f"taichi-mrf live {words}" if endless else f"taichi-mrf map {words} --out DIR"
 
 
 def _print_topics(console: Terminal, bag: BagSummary) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +97,25 @@ StampedPoses = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
 """Stamps in seconds, and the poses (4, 4) T_world_camera at them."""
 
 
+class EndlessNames(Sequence[str]):
+    """Names of frames that are numbered as they arrive, behind a ``prefix``."""
+
+    def __init__(self, prefix: str = "") -> None:
+        self.prefix = prefix
+
+    def __len__(self) -> int:
+        return 2**31 - 1
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[str]: ...
+    def __getitem__(self, index: int | slice) -> str | list[str]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return f"{self.prefix}{index:06d}"
+
+
 @dataclass
 class Dataset(ABC):
     """A sequence of frames that are read one at a time.
@@ -120,6 +139,11 @@ class Dataset(ABC):
         """True if the source never ends, as a camera: then len has no meaning, frames cannot be read twice,
         and an error other than FrameError ends the sequence."""
         return False
+
+    def awaiting(self) -> str:
+        """Look for the next frame of a source that never ends, and say what it waits for, in words; empty if
+        the frame is there."""
+        return ""
 
     @property
     def stated(self) -> StatedSensor:

@@ -40,6 +40,10 @@ class Derived(Dataset):
         """True if the source is."""
         return self.source.endless
 
+    def awaiting(self) -> str:
+        """What the source waits for."""
+        return self.source.awaiting()
+
     @property
     def stated(self) -> StatedSensor:
         """The source's."""

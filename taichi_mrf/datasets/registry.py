@@ -14,13 +14,13 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import mended, pose_of, resampled
-from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
+from taichi_mrf.datasets.entries import BUILT_IN, FORMATS, FOXGLOVE
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.ros.names import is_bag
@@ -28,6 +28,9 @@ from taichi_mrf.datasets.turned import T_sensor_stored, stored_camera
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
+
+if TYPE_CHECKING:
+    from taichi_mrf.datasets.ros.bag import BagSummary
 
 GROUP = "taichi_mrf.formats"
 
@@ -155,10 +158,14 @@ def is_rendered(source: str) -> bool:
     return built_in is not None and built_in.rendered
 
 
-def bag_path(source: str) -> Path | None:
-    """The bag that a source names, None if it is something else."""
+def topics_in(source: str) -> "BagSummary | None":
+    """The topics of a bag, or of a robot that runs, which is listened to for some seconds; None for other
+    sources. Raises DatasetError."""
+    if source.startswith(FOXGLOVE):
+        address = source.removeprefix(FOXGLOVE).partition("?")[0]
+        return resolve_name("taichi_mrf.datasets.wires.robot:summarise")(address)
     path, _ = _path_and_query(source)
-    return path if is_bag(path) else None
+    return resolve_name("taichi_mrf.datasets.ros.bag:summarise")(path) if is_bag(path) else None
 
 
 def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:

@@ -129,6 +129,15 @@ class TimedPoses:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def add(self, stamp: float, pose: Pose, keep_s: float) -> None:
+        """Add a pose that has just come, and drop those that are more than ``keep_s`` seconds older than the
+        newest; all, if it is so much older itself, as of a clock that has started again."""
+        oldest = float(self.stamps.max(initial=stamp)) - keep_s
+        kept = (self.stamps >= oldest) & (stamp >= oldest)
+        stamps, poses = np.append(self.stamps[kept], stamp), np.append(self.poses[kept], pose[None], axis=0)
+        merged = TimedPoses(stamps, poses)
+        self.stamps, self.poses = merged.stamps, merged.poses
+
     @property
     def stands_still(self) -> bool:
         """True if several poses are all the same."""

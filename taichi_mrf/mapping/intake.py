@@ -236,6 +236,6 @@ class Intake:
 
 
 def hold_out_of(dataset: Dataset, config: Config) -> int:
-    """One frame in so many of a dataset is held out; 0 for none. A camera's images cannot be read again, and
-    its poses are not known before they are tracked: nothing could be checked against them."""
-    return 0 if dataset.tracked and dataset.endless else config.evaluation.hold_out
+    """One frame in so many of a dataset is held out; 0 for none. The images of a camera or a robot cannot be
+    read again: nothing could be checked against them."""
+    return 0 if dataset.endless else config.evaluation.hold_out

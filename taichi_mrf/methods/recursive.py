@@ -224,9 +224,10 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         """Rebuild the map if it is stale; otherwise do nothing.
 
         All scans are integrated again in the order in which they were added, with a half-life in that of
-        their stamps. The result is the map of these scans alone. ``sweeps``, ``tolerance`` and ``keyframes`` are arguments of MRFMap.infer; here they are
-        checked and ignored. ``progress`` is called after each scan; if it returns False, the map holds the
-        scans up to there and stays stale. Raises CapacityError if there is not enough memory.
+        their stamps. The result is the map of these scans alone. ``sweeps``, ``tolerance`` and ``keyframes``
+        are arguments of MRFMap.infer; here they are checked and ignored. ``progress`` is called after each
+        scan; if it returns False, the map holds the scans up to there and stays stale. Raises CapacityError
+        if there is not enough memory.
         """
         return driven(self.infer_steps(sweeps, tolerance, keyframes), progress)
 

@@ -15,6 +15,9 @@ from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.frame import Frame
 
+LOOK_S = 0.02
+"""How often it is looked whether a source that never ends has its next frame."""
+
 
 class Replay:
     """The frames 0, ``every``, 2 ``every``, ... of a source, ``limit`` of them at most, in time.
@@ -86,6 +89,11 @@ class Replay:
         """The multiple of the recording's own pace, 0 as fast as possible."""
         return self._speed
 
+    @property
+    def awaiting(self) -> str:
+        """What a source that never ends waits for, in words."""
+        return self._dataset.awaiting()
+
     def set_speed(self, factor: float) -> None:
         """Change the speed from here on. Raises ConfigError if it is negative or not finite."""
         if not (math.isfinite(factor) and factor >= 0):
@@ -104,7 +112,9 @@ class Replay:
         """Seconds until the next frame is due, 0 if it is, None while paused and after the last."""
         if self.paused or self.finished:
             return None
-        if self._speed == 0 or self._dataset.endless:
+        if self._dataset.endless:
+            return LOOK_S if self._dataset.awaiting() else 0.0
+        if self._speed == 0:
             return 0.0
         if self._ahead is None:
             self._ahead = self._read()

@@ -321,7 +321,9 @@ class Run(SessionCore):
         if self.replay.finished:
             doing = "done" if self.follower is None else f"following {self.follower.name}"
             return self.replay.problem or f"{doing}: the map is up to date"
-        return "waiting: paused" if self.replay.paused else "waiting for the next frame"
+        if self.replay.paused:
+            return "waiting: paused"
+        return f"waiting for {self.replay.awaiting or 'the next frame'}"
 
     def _send_layers(self, layers: list[Bricks]) -> bool:
         for bricks in layers:

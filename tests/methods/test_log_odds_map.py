@@ -322,7 +322,8 @@ def test_with_a_half_life_the_order_in_which_scans_come_does_not_matter() -> Non
         m.infer()
         assert not m.stale
         found.append(m.voxels(0.0))
-    assert m.state(np.array([[0.02, 0.02, 1.02], [0.02, 0.02, 2.02]])).tolist() == [FREE, OCCUPIED]
+    middle = CAMERA.rays()[CAMERA.height // 2, CAMERA.width // 2]
+    assert m.state(np.outer((1.02, 2.02), middle)).tolist() == [FREE, OCCUPIED]
     for other in found[1:]:
         for now, then in zip(other, found[0], strict=True):
             np.testing.assert_array_equal(now, then)

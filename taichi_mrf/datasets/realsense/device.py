@@ -13,12 +13,12 @@ import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, NumberedRow, Table, start_pose
+from taichi_mrf.datasets.base import Dataset, EndlessNames, NumberedRow, Table, start_pose
 from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
@@ -196,22 +196,6 @@ class RealSenseOptions:
     """none, to track the camera without its gyroscope and accelerometer."""
 
 
-class _EndlessNames(Sequence[str]):
-    """Names of frames that are numbered as they arrive."""
-
-    def __len__(self) -> int:
-        return 2**31 - 1
-
-    @overload
-    def __getitem__(self, index: int) -> str: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[str]: ...
-    def __getitem__(self, index: int | slice) -> str | list[str]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return f"realsense-{index:06d}"
-
-
 @dataclass
 class RealSenseCamera(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step;
@@ -237,7 +221,7 @@ class RealSenseCamera(Dataset):
     @property
     def frame_names(self) -> Sequence[str]:
         """Names without end."""
-        return _EndlessNames()
+        return EndlessNames("realsense-")
 
     def read(self, index: int) -> Frame:
         """The camera's next image, whatever the index. Raises FrameError if none comes in time, DatasetError

@@ -30,22 +30,27 @@ from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.poses import PoseChoice, pose_candidates
-from taichi_mrf.datasets.ros.reader import BagRow, Entry, RosReader, Topic
-from taichi_mrf.datasets.ros.sensor import BagCameras, find_cameras, find_sensor, posed_by, poses_of, track_of
+from taichi_mrf.datasets.ros.poses import pose_candidates
+from taichi_mrf.datasets.ros.reader import BagRow, RosReader
+from taichi_mrf.datasets.ros.sensor import (
+    BagCameras,
+    DepthChoice,
+    find_depth_camera,
+    find_sensor,
+    posed_by,
+    poses_of,
+    track_of,
+)
+from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
-    DepthTopic,
     choose,
     cloud_topics,
     depth_topics,
-    described,
     message_frame,
-    no_depth,
-    packed_otherwise,
 )
 from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap
-from taichi_mrf.errors import DatasetError, naming
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -64,14 +69,8 @@ _LOOKED_AT = 4
 
 
 @dataclass(frozen=True)
-class BagOptions(PoseChoice):
+class BagOptions(DepthChoice):
     """The options after the name of a bag."""
-
-    depth: str = ""
-    """The topic of depth images."""
-
-    info: str = ""
-    """The topic of their CameraInfo."""
 
     color: str = ""
     """The topic of colour images, by default the only one."""
@@ -145,16 +144,9 @@ class RosBag(Table[BagRow]):
 
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one image, which must have its camera's size."""
-        where = f"{self.reader.path}: topic {self.topic}"
         message = self.reader.read(self.topic, row.entry)
-        with naming(where):
-            depth_m = messages.depth_image(message, self.depth_scale)
-        camera = self.cameras.at(row.entry, depth_m.shape)
-        if depth_m.shape != camera.shape:
-            raise DatasetError(
-                f"{where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
-                f"the camera {camera.width} x {camera.height}"
-            )
+        where = f"{self.reader.path}: topic {self.topic}"
+        depth_m, camera = self.cameras.measured(message, row.entry, self.depth_scale, where)
         color = sigma_m = None
         if self.colors is not None:
             color = self.colors.read(index, depth_m, camera)
@@ -202,15 +194,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
 def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Dataset:
     if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
         return _open_lidar(reader, chosen, options)
-    depth = _depth_topic(reader, chosen.depth)
-    sensor = find_sensor(reader, depth.name, "images", chosen)
-    cameras = find_cameras(sensor, depth, chosen.info, options)
-    found = poses_of(sensor, chosen)
-    if any(each.registered for each in found.values()):
-        raise DatasetError(
-            f"{reader.path}: the images of {depth.name} say that they are in {depth.frame}, the frame that "
-            "the poses are in: ?optical=FRAME names the camera's own"
-        )
+    depth, sensor, cameras, found = find_depth_camera(reader, chosen, options)
     posed, notes = posed_by(sensor, found, options)
     dropped = len(sensor.entries) - len(posed)
     stamps, colors = [entry.stamp for _, entry, _ in posed], None
@@ -286,19 +270,6 @@ def _rows(reader: RosReader, posed: Sequence[tuple[int, Entry, Pose]]) -> list[B
     return [BagRow(f"{i:06d}", entry.stamp, pose, f"{reader.path}", entry) for i, entry, pose in posed]
 
 
-def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
-    topics = {topic.name: topic for topic in depth_topics(reader)}
-    unread = [] if topics else packed_otherwise(reader)
-    if not (topics or unread or wanted):
-        raise DatasetError(f"{reader.path}: {no_depth(reader)}")
-    what = f"topics of depth images ({messages.ENCODINGS})"
-    name = choose(reader, "depth", wanted, [*topics, *unread], what)
-    topic = topics.get(name) or described(reader, name)
-    with naming(f"{reader.path}: topic {name}"):
-        messages.check_depth(topic.encoding)
-    return topic
-
-
 @dataclass(frozen=True)
 class BagSummary:
     """The contents of a bag.
@@ -324,29 +295,34 @@ def summarise(path: Path) -> BagSummary:
     """Look into a bag. Raises DatasetError, whose text names the file, if it cannot be read."""
     reader = RosReader(path)
     try:
-        topics = list(reader.topics.values())
-        if any(topic.name.startswith(REALSENSE) for topic in topics):
-            return BagSummary(topics, {}, reader.duration, [], [f"realsense:{path}?poses=FILE"], "")
-        depth, sent = depth_topics(reader), read_transforms(reader)
-        remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
-        clouds = {name: message_frame(reader, name) for name in cloud_topics(reader)}
-        remarks |= {name: f"points, frame {frame or 'unnamed'}" for name, frame in clouds.items()}
-        frames = clouds | {each.name: each.frame for each in depth} or {"": ""}
-        trees = {name: _tree_or_none(sent, name, frame) for name, frame in frames.items()}
-        chosen = {each.name: [f"depth={each.name}"] * (len(depth) > 1) for each in depth}
-        for each in depth:
-            chosen[each.name] += [f"info={each.info[0]}"] if len(each.info) > 1 else []
-        chosen |= {name: [f"points={name}"] * (bool(depth) or len(clouds) > 1) for name in clouds}
-        return BagSummary(
-            topics,
-            remarks,
-            reader.duration,
-            list(dict.fromkeys(words for tree in trees.values() for words in _transforms(tree))),
-            [each for name, of in chosen.items() for each in _sources(reader, trees[name], frames[name], of)],
-            "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
-        )
+        return summary_of(reader)
     finally:
         reader.close()
+
+
+def summary_of(reader: TopicSource) -> BagSummary:
+    """What topics hold, and how to name them. Raises DatasetError, which names the source."""
+    topics = list(reader.topics.values())
+    if any(topic.name.startswith(REALSENSE) for topic in topics):
+        return BagSummary(topics, {}, reader.duration, [], [f"realsense:{reader.path}?poses=FILE"], "")
+    depth, sent = depth_topics(reader), read_transforms(reader)
+    remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
+    clouds = {name: message_frame(reader, name) for name in cloud_topics(reader)}
+    remarks |= {name: f"points, frame {frame or 'unnamed'}" for name, frame in clouds.items()}
+    frames = clouds | {each.name: each.frame for each in depth} or {"": ""}
+    trees = {name: _tree_or_none(sent, name, frame) for name, frame in frames.items()}
+    chosen = {each.name: [f"depth={each.name}"] * (len(depth) > 1) for each in depth}
+    for each in depth:
+        chosen[each.name] += [f"info={each.info[0]}"] if len(each.info) > 1 else []
+    chosen |= {name: [f"points={name}"] * (bool(depth) or len(clouds) > 1) for name in clouds}
+    return BagSummary(
+        topics,
+        remarks,
+        reader.duration,
+        list(dict.fromkeys(words for tree in trees.values() for words in _transforms(tree))),
+        [each for name, of in chosen.items() for each in _sources(reader, trees[name], frames[name], of)],
+        "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
+    )
 
 
 def _tree_or_none(sent: dict[str, Transforms], topic: str, frame: str) -> TransformTree:
@@ -365,7 +341,7 @@ def _transforms(tree: TransformTree) -> list[str]:
     return words + [dispute.problem for dispute in tree.disputed.values()]
 
 
-def _pose_options(reader: RosReader, tree: TransformTree, frame: str) -> list[list[str]]:
+def _pose_options(reader: TopicSource, tree: TransformTree, frame: str) -> list[list[str]]:
     """For each source of poses the options that choose it."""
     try:
         poses = [f"pose={name}" for name in pose_candidates(reader, tree, frame)]
@@ -374,7 +350,7 @@ def _pose_options(reader: RosReader, tree: TransformTree, frame: str) -> list[li
     return [[]] if len(poses) == 1 else [[pose] for pose in poses or ["poses=FILE"]]
 
 
-def _sources(reader: RosReader, tree: TransformTree, frame: str, chosen: list[str]) -> list[str]:
+def _sources(reader: TopicSource, tree: TransformTree, frame: str, chosen: list[str]) -> list[str]:
     """The source's name with the options that have to be ``chosen`` for a topic, for each source of poses."""
     found = [[*chosen, *pose] for pose in _pose_options(reader, tree, frame)]
     return [f"{reader.path}?{'&'.join(options)}" if options else str(reader.path) for options in found]

@@ -21,8 +21,8 @@ from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor, camera_of
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics, topics_of
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -39,7 +39,7 @@ class Beside:
     """The images of one topic: ``entries`` has the one that belongs to each depth image, or None. ``decode``
     brings a message to the pixels of a depth image (H, W) of a camera."""
 
-    reader: RosReader
+    reader: TopicSource
     topic: str
     entries: Sequence[Entry | None]
     decode: Callable[[Any, NDArray[np.float32], PinholeCamera], NDArray[Any]]
@@ -95,7 +95,7 @@ def _beside(name: str, depth: str) -> bool:
     return parts[: parts.index(PART)] == of_depth[: of_depth.index("depth")]
 
 
-def _misfit(reader: RosReader, name: str, camera: PinholeCamera) -> str | None:
+def _misfit(reader: TopicSource, name: str, camera: PinholeCamera) -> str | None:
     """Why a topic's images cannot be the confidence of a camera's, None if they can. Raises DatasetError if
     it holds no images."""
     described(reader, name)

@@ -21,9 +21,10 @@ from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import PATH
 from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_connect, pose_candidates
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
+from taichi_mrf.datasets.ros.sources import Entry
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     FROM_TF,

@@ -22,8 +22,8 @@ from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
@@ -36,6 +36,10 @@ NO_POSES = (
     "lines of stamp tx ty tz qx qy qz qw from a tracker or SLAM, or ?poses=track, which finds them from the "
     "images"
 )
+
+
+KEPT_S = 10.0
+"""Poses of a robot that runs are kept for so many seconds."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class BagPoses:
     """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
     poses and the time that they span, ``stamps`` are theirs, if known. ``registered``: the sensor's data are
     not in its own frame but in the fixed one, where an odometry has put them. ``assumed``: nothing says that
-    the poses are of the sensor's own axes."""
+    the poses are of the sensor's own axes. ``hear`` takes a message of a robot that runs, on a topic;
+    ``moving`` are the poses that ``at`` interpolates."""
 
     at: Callable[[float, float], Pose | None]
     source: str
@@ -79,9 +84,18 @@ class BagPoses:
     registered: bool = False
     stamps: Sequence[float] | NDArray[np.float64] = ()
     assumed: bool = False
+    hear: Callable[[Topic, Entry, Any], None] = lambda topic, entry, message: None
+    moving: Sequence[TimedPoses] = ()
+
+    @property
+    def until(self) -> float:
+        """The time in seconds up to which poses are known: later ones have yet to come. A transform that came
+        once, beside others that come again, does not move."""
+        again = [each for each in self.moving if len(each) > 1] or self.moving
+        return min((float(each.stamps[-1]) for each in again), default=math.inf)
 
 
-def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
+def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:
     """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree; without
     topics also if transforms that may move do not. Raises DatasetError if there are none because publishers
     disagree."""
@@ -101,7 +115,7 @@ def _is_apart(topic: str, tree: TransformTree) -> bool:
 
 
 def find_poses(
-    reader: RosReader,
+    reader: TopicSource,
     frame: str,
     choice: PoseChoice,
     read: Callable[[], TransformTree],
@@ -144,7 +158,7 @@ def find_poses(
     return _from_topic(reader, name, tree, optical, choice, run or BagRun())
 
 
-def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
+def _from_tree(reader: TopicSource, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
     if optical not in tree.frames:
         raise _unknown_frame(reader, tree, optical)
     if not choice.frame:
@@ -152,19 +166,27 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
     fixed = choice.frame or tree.ancestors(optical)[-1]
     must_connect(reader, tree, fixed, optical)
     note = f"poses in {fixed} from tf, of {optical}"
-    moving = [edge.stamps for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
-    first, last = (max(s[0] for s in moving), min(s[-1] for s in moving)) if moving else (0.0, float("inf"))
+    moving = [edge for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
+    first = max((each.stamps[0] for each in moving), default=0.0)
+    last = min((each.stamps[-1] for each in moving), default=math.inf)
     span = f"{first:.3f} to {last:.3f} s"
+
+    def hear(topic: Topic, entry: Entry, message: Any) -> None:
+        if topic.type in messages.TF:
+            tree.hear(topic.name, entry, message, moving, KEPT_S)
+
     return BagPoses(
         lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
         f"tf from {fixed} to {optical}: {span}",
         [note],
-        stamps=max(moving, key=len, default=()),
+        stamps=max((each.stamps for each in moving), key=len, default=()),
+        hear=hear,
+        moving=moving,
     )
 
 
 def _of_body(
-    reader: RosReader, tree: TransformTree, fixed: str, below: list[str], choice: PoseChoice
+    reader: TopicSource, tree: TransformTree, fixed: str, below: list[str], choice: PoseChoice
 ) -> BagPoses:
     """The poses of a body of the tree, from whose place the data were moved to the ``fixed`` frame. Raises
     DatasetError if several may be it."""
@@ -184,7 +206,7 @@ def _of_body(
 
 
 def _from_topic(
-    reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
+    reader: TopicSource, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
 ) -> BagPoses:
     timed, parent, child, notes = _read_poses(reader, name, choice, run)
     tree = tree.towards(choice.body or child, named=False)
@@ -209,14 +231,47 @@ def _from_topic(
         known = [step for step in steps if step is not None]
         return None if len(known) < len(steps) else reduce(np.matmul, known)
 
+    moving = [timed]
+    if not registered:
+        steps = [*tree.between(fixed, parent), *tree.between(body, optical)]
+        moving += [step for step in steps if isinstance(step, TimedPoses)]
+
+    def hear(topic: Topic, entry: Entry, message: Any) -> None:
+        if topic.type in messages.TF:
+            tree.hear(topic.name, entry, message, moving, KEPT_S)
+        elif topic.name == name and _is_of(entry, message, parent, child):
+            pose = _valid_pose(message)
+            if pose is not None:
+                timed.add(entry.stamp, pose, KEPT_S)
+
     source = f"{name}: {_span(timed)}"
     if registered:
         return BagPoses(at, source, notes, registered=True)
-    return BagPoses(at, source, notes, stamps=timed.stamps, assumed=body == optical and child != optical)
+    return BagPoses(
+        at,
+        source,
+        notes,
+        stamps=timed.stamps,
+        assumed=body == optical and child != optical,
+        hear=hear,
+        moving=moving,
+    )
+
+
+def _is_of(entry: Entry, message: Any, parent: str, child: str) -> bool:
+    """True if a pose is of a body in a frame, or does not say otherwise."""
+    return entry.frame in ("", parent) and frame_name(getattr(message, "child_frame_id", "")) in ("", child)
+
+
+def _valid_pose(message: Any) -> Pose | None:
+    try:
+        return as_pose(messages.pose_of(message))
+    except KeyframeError:
+        return None
 
 
 def _read_poses(
-    reader: RosReader, name: str, choice: PoseChoice, run: BagRun
+    reader: TopicSource, name: str, choice: PoseChoice, run: BagRun
 ) -> tuple[TimedPoses, str, str, list[str]]:
     """A topic's poses, the frame that they are in, the frame that they are of (empty if not given), and
     notes. Raises DatasetError if they are of several bodies."""
@@ -229,9 +284,8 @@ def _read_poses(
     broken = 0
     unstamped: set[Entry] = set()
     for entry, message in _of_path(reader, name) if topic.type == messages.PATH else reader.messages(name):
-        try:
-            pose = as_pose(messages.pose_of(message))
-        except KeyframeError:
+        pose = _valid_pose(message)
+        if pose is None:
             broken += 1
             continue
         child = frame_name(getattr(message, "child_frame_id", ""))
@@ -266,7 +320,7 @@ def _read_poses(
     return TimedPoses(stamps, poses), parent, child, notes
 
 
-def _of_path(reader: RosReader, name: str) -> Iterator[tuple[Entry, Any]]:
+def _of_path(reader: TopicSource, name: str) -> Iterator[tuple[Entry, Any]]:
     """The poses of the last message of a Path, which has all of them."""
     for entry, message in deque(reader.messages(name), maxlen=1):
         for i, each in enumerate(message.poses):
@@ -360,7 +414,7 @@ def _is_cameras(frame: str) -> bool:
     return ("cam" in name or "optical" in name) and not is_body
 
 
-def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
+def must_connect(reader: TopicSource, tree: TransformTree, a: str, b: str) -> None:
     """Raise DatasetError, which lists the frames, unless the tree connects two frames."""
     for frame in (a, b):
         if a != b and frame not in tree.frames:
@@ -371,7 +425,7 @@ def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None
         raise DatasetError(f"{reader.path}: tf does not connect {a} and {b}")
 
 
-def _unknown_frame(reader: RosReader, tree: TransformTree, frame: str) -> DatasetError:
+def _unknown_frame(reader: TopicSource, tree: TransformTree, frame: str) -> DatasetError:
     known = ", ".join(tree.frames) or "none"
     return DatasetError(f"{reader.path}: tf has no frame '{frame}'; its frames: {known}")
 

@@ -25,8 +25,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from taichi_mrf.datasets.base import Row
-from taichi_mrf.datasets.ros.messages import frame_name, header_ns
+from taichi_mrf.datasets.ros.decoding import CDR, LANGUAGES, ROS1, Decoder, ros2_name
 from taichi_mrf.datasets.ros.names import METADATA, parts_of
+from taichi_mrf.datasets.ros.sources import NANOSECONDS, Channel, Entry, Place, Topic, TopicSource, entry_of
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.bounded import BoundedFile, stored_only
 from taichi_mrf.system.files import check_regular, is_file, is_folder, read_text
@@ -78,58 +79,47 @@ def _zstd() -> Any:
         return importlib.import_module("backports.zstd")
 
 
-ROS1 = "ros1"
-_ENCODINGS = ("cdr", ROS1, "")
-_IDL_RULE = "=" * 80 + "\n"
-
-
-def open_tolerantly(paths: Sequence[Path]) -> tuple[Any, list[tuple[Any, str]]]:
-    """An open AnyReader with the connections that can be read, and the others, each with the reason. Raises
-    errors of many kinds for a damaged file."""
-    highlevel, typesys = (
-        importlib.import_module("rosbags.highlevel"),
-        importlib.import_module("rosbags.typesys"),
-    )
+def open_tolerantly(paths: Sequence[Path]) -> tuple[Any, Decoder, list[tuple[Any, str]]]:
+    """An open AnyReader with the connections that can be read, what decodes their messages, and the other
+    connections, each with the reason. Raises errors of many kinds for a damaged file."""
     _tolerate_schemas()
-    reader = highlevel.AnyReader(paths)
+    reader, decoder = importlib.import_module("rosbags.highlevel").AnyReader(paths), Decoder()
     unread: list[tuple[Any, str]] = []
-    # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
-    known = typesys.get_typestore(typesys.Stores.LATEST).fielddefs if reader.is2 else {}
 
     def open_types() -> None:
         for each in reader.readers:
             reader.stack.enter_context(each)
-        types: dict[str, Any] = {}
-        store = typesys.get_typestore(typesys.Stores.EMPTY)
-        found = []
-        for each in (each for part in reader.readers for each in part.connections):
-            try:
-                if getattr(each.ext, "serialization_format", "") not in _ENCODINGS:
-                    raise ValueError(f"its messages are {each.ext.serialization_format}")
-                each = each._replace(msgtype=msgtype_of(each))
-                types |= _defined(each, known, typesys)
-                found.append(each)
-            except Exception as error:  # the library raises many kinds of errors
-                unread.append((each, said(error)))
-        store.register(types)
-        for each in found:
-            if each.digest and each.msgdef.data and _digest(store, each.msgtype, reader.is2) != each.digest:
+        connections = [each for part in reader.readers for each in part.connections]
+        connections = [each._replace(msgtype=msgtype_of(each)) for each in connections]
+        problems = decoder.learn([_channel_of(each, reader.is2) for each in connections])
+        for each, problem in zip(connections, problems, strict=True):
+            if problem:
+                unread.append((each, problem))
+            elif each.digest and each.msgdef.data and _digest(decoder, each, reader.is2) != each.digest:
                 unread.append((each, "its messages were written with another definition"))
             else:
                 reader.connections.append(each)
-        reader.typestore = store
+        reader.typestore = decoder.store
 
     reader._open = open_types
     reader.open()
-    return reader, unread
+    return reader, decoder, unread
+
+
+def _encoding_of(connection: Any, is2: bool) -> str:
+    return getattr(connection.ext, "serialization_format", "") or (CDR if is2 else ROS1)
+
+
+def _channel_of(connection: Any, is2: bool) -> Channel:
+    text, language = connection.msgdef.data, connection.msgdef.format.name
+    return Channel(connection.topic, connection.msgtype, _encoding_of(connection, is2), language, text)
 
 
 def msgtype_of(connection: Any) -> str:
     """The type of a connection's messages as ROS 2 writes it; in an MCAP file converted from ROS 1 it is
     written in another way."""
-    package, _, name = connection.msgtype.partition("/")
-    is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1 and "/" not in name
-    return f"{package}/msg/{name}" if is_ros1 else connection.msgtype
+    is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1
+    return ros2_name(connection.msgtype) if is_ros1 else connection.msgtype
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -142,40 +132,22 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
 
 
-def _digest(store: Any, msgtype: str, is2: bool) -> str:
+def _digest(decoder: Decoder, connection: Any, is2: bool) -> str:
     """The number by which a definition is known again, "" for one that names types which are not defined."""
+    store, msgtype = decoder.store, connection.msgtype
     try:
         return str(store.hash_rihs01(msgtype) if is2 else store.generate_msgdef(msgtype)[1])
     except Exception:
         return ""
 
 
-def _defined(connection: Any, known: dict[str, Any], typesys: Any) -> dict[str, Any]:
-    """The types of a connection's messages, by its definition or those that are known."""
-    text, kind = connection.msgdef.data, connection.msgdef.format.name
-    if kind == "NONE":
-        return known
-    try:
-        if kind == "MSG":
-            return dict(typesys.get_types_from_msg(text, connection.msgtype))
-        if not text.startswith(f"{_IDL_RULE}IDL: "):
-            return dict(typesys.get_types_from_idl(text))
-        parts = [part.split("\n", 1)[1] for part in text.split(_IDL_RULE)[1:]]
-        return {name: each for part in parts for name, each in typesys.get_types_from_idl(part).items()}
-    except Exception:
-        if connection.msgtype in known:
-            return known
-        raise
-
-
 def _tolerate_schemas() -> None:
     """Let rosbags read past MCAP's schemas that are not of ROS; to do so again changes nothing."""
     mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
     formats = importlib.import_module("rosbags.interfaces")
-    of_ros = {"ros2msg": "MSG", "ros1msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
 
     def get_msgdef(schema: Any) -> Any:
-        kind = formats.MessageDefinitionFormat[of_ros.get(schema.encoding if schema else "", "NONE")]
+        kind = formats.MessageDefinitionFormat[LANGUAGES.get(schema.encoding if schema else "", "NONE")]
         return formats.MessageDefinition(kind, schema.data if kind.name != "NONE" else "")
 
     def read_string(file: Any) -> str:
@@ -184,10 +156,6 @@ def _tolerate_schemas() -> None:
         return "ros2" if is_profile else text
 
     vars(mcap).update(get_msgdef=get_msgdef, read_string=read_string)
-
-
-Place = tuple[int, int]
-"""The time of recording of a message in nanoseconds, and a number that grows along the recording."""
 
 
 def places_of(readers: Sequence[Any], topic: str, msgtype: str) -> list[Place]:
@@ -224,37 +192,6 @@ def _places(file: Any, ids: Sequence[int]) -> Iterator[Place]:
 LONGEST_PAUSE_S = 5.0
 """Between the files of a recording that was split while it ran."""
 
-_NANOSECONDS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image, and why if its
-    messages cannot be read."""
-
-    name: str
-    type: str
-    messages: int
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Place of a message: recorded at ``recorded_ns``, the ``ordinal``-th of its topic (from 0) then."""
-
-    recorded_ns: int
-    ordinal: int
-    stamp: float
-    """The header's stamp in seconds, or the time of recording where there is no header or its stamp is 0."""
-
-    frame: str = ""
-    """The frame in the header."""
-
-    publisher: str = ""
-    """The node that sent it, which only ROS 1 records."""
-
-    place: int = 0
-    """Grows in the order of recording: its time, or the place in the file if that time starts again."""
-
 
 @dataclass(frozen=True)
 class BagRow(Row):
@@ -263,9 +200,10 @@ class BagRow(Row):
     entry: Entry
 
 
-class RosReader:
-    """An open bag. ``topics`` are those by name, ``duration`` the seconds from the first message to the last;
-    messages are objects with the fields of their type."""
+class RosReader(TopicSource):
+    """An open bag."""
+
+    path: Path
 
     def __init__(self, path: Path) -> None:
         """Open a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or one with the files of a recording
@@ -281,7 +219,7 @@ class RosReader:
         library("rosbags.highlevel", "bags need", "ros", DatasetError)
         try:
             bound_unpacking()
-            self._reader, unread = open_tolerantly(self.parts or files_of(path) or [path])
+            self._reader, self._decoder, unread = open_tolerantly(self.parts or files_of(path) or [path])
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
@@ -292,13 +230,13 @@ class RosReader:
             for each, why in unread:
                 topics.setdefault(each.topic, Topic(each.topic, f"{each.msgtype} ({why})", each.msgcount))
             self.topics = dict(sorted(topics.items()))
-            self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
+            self.duration = max(0, self._reader.duration) / NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises many kinds of errors
             raise DatasetError(f"{path}: {_unreadable(said(error))}") from error
         self._open, self.by_file = True, False
         times = [(each.start_time, each.end_time) for each in self._reader.readers]
         for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
-            if abs(began - ended) > LONGEST_PAUSE_S * _NANOSECONDS:
+            if abs(began - ended) > LONGEST_PAUSE_S * NANOSECONDS:
                 self.close()
                 raise DatasetError(
                     f"{path}: contains several recordings ({part.name} begins {(began - ended) / 1e9:.1f} s "
@@ -313,15 +251,14 @@ class RosReader:
             self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
-        """All messages of a topic in the order of recording. Raises DatasetError, naming file and topic."""
+        """In the order of recording."""
         previous, ordinal = None, 0
         places = self.places(topic) if self.by_file else []
         for number, (recorded_ns, message, publisher) in enumerate(self._read(topic, None, None)):
             ordinal = ordinal + 1 if recorded_ns == previous else 0
             previous = recorded_ns
-            stamp, frame = _header(message, recorded_ns)
             place = places[number][1] if number < len(places) else recorded_ns
-            yield Entry(recorded_ns, ordinal, stamp, frame, publisher, place), message
+            yield entry_of(message, recorded_ns, ordinal, publisher, place), message
 
     def places(self, topic: str) -> list[Place]:
         """The places in the file of a topic's messages, in the order of ``messages``; none if its index is
@@ -330,10 +267,6 @@ class RosReader:
             return places_of(self._reader.readers, topic, self.topics[topic].type)
         except Exception:  # as on opening
             return []
-
-    def first(self, topic: str) -> Any | None:
-        """The first message of a topic, None if there is none."""
-        return next((message for _, message in self.messages(topic)), None)
 
     def read(self, topic: str, entry: Entry) -> Any:
         """One message again. Raises DatasetError, which names file and topic."""
@@ -351,13 +284,8 @@ class RosReader:
                 if msgtype != self.topics[topic].type:  # in a damaged file
                     raise ValueError(f"contains a {msgtype}")
                 publisher = getattr(connection.ext, "callerid", None) or ""
-                is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1
-                store = self._reader.typestore
-                message = (
-                    store.deserialize_ros1(data, msgtype)
-                    if is_ros1
-                    else self._reader.deserialize(data, msgtype)
-                )
+                encoding = _encoding_of(connection, self._reader.is2)
+                message = self._decoder.decode(msgtype, encoding, data)
                 yield recorded_ns, message, publisher
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
@@ -380,11 +308,3 @@ def _unreadable(problem: str) -> str:
         f"cannot be read as a bag, it is damaged or cut short: {problem}; 'rosbag reindex', 'ros2 bag "
         "reindex' or 'mcap recover' may mend a recording that was not closed"
     )
-
-
-def _header(message: Any, recorded_ns: int) -> tuple[float, str]:
-    """Stamp and frame of a message."""
-    header = getattr(message, "header", None)
-    if header is None:
-        return recorded_ns / _NANOSECONDS, ""
-    return (header_ns(header) or recorded_ns) / _NANOSECONDS, frame_name(header.frame_id)

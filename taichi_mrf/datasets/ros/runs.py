@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.trajectories import starts_of_runs
 from taichi_mrf.errors import DatasetError
 
@@ -80,7 +80,7 @@ def choose_run(
 
 
 def run_of(
-    reader: RosReader, topic: str, entries: Sequence[Entry], wanted: int, what: str
+    reader: TopicSource, topic: str, entries: Sequence[Entry], wanted: int, what: str
 ) -> tuple[BagRun, Sequence[Entry], list[str]]:
     """The run that is read, its messages of the sensor's topic, and a note of the others. Raises DatasetError
     if there is no such run."""

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,11 @@ from taichi_mrf.datasets.base import StampedPoses
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, choose_depth
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
 from taichi_mrf.datasets.turned import of_image_size, turn_hint
 from taichi_mrf.errors import ConfigError, DatasetError, naming
@@ -28,11 +28,22 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
+class DepthChoice(PoseChoice):
+    """How the images of depth and their poses are chosen."""
+
+    depth: str = ""
+    """The topic of depth images."""
+
+    info: str = ""
+    """The topic of their CameraInfo."""
+
+
+@dataclass(frozen=True)
 class BagSensor:
     """The messages of a topic, ``what``, that are of one run, by their stamps. ``frame`` is the sensor's, by
     the user's word or the first message; ``tree`` reads its tree of frames."""
 
-    reader: RosReader
+    reader: TopicSource
     topic: str
     what: str
     frame: str
@@ -47,7 +58,7 @@ class BagSensor:
         return Counter(entry.frame for entry in self.entries)
 
 
-def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) -> BagSensor:
+def find_sensor(reader: TopicSource, topic: str, what: str, choice: PoseChoice) -> BagSensor:
     """The messages of a topic that are read. Raises DatasetError, naming file and topic, if there is none, or
     no run that the user wants, or if they are of several frames and of none that the user named."""
     recorded, said = stamped(reader, topic, what)
@@ -74,7 +85,7 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
     )
 
 
-def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
+def _tree(reader: TopicSource, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
     try:
         return tree_of(read_transforms(reader), topic, frame, tf, run)
     except DatasetError as error:
@@ -101,7 +112,7 @@ def poses_of(sensor: BagSensor, choice: PoseChoice) -> dict[str, BagPoses]:
     return found
 
 
-def _several(reader: RosReader, topic: str, what: str, frames: Mapping[str, int]) -> str:
+def _several(reader: TopicSource, topic: str, what: str, frames: Mapping[str, int]) -> str:
     words = ", ".join(f"{frame or 'unnamed'} ({count})" for frame, count in frames.items())
     return f"{reader.path}: topic {topic} has {what} of several frames, {words}, as of several sensors"
 
@@ -139,6 +150,31 @@ def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[]
         return [stamp for stamp, T in known if T is not None], [T for _, T in known if T is not None]
 
     return read
+
+
+class DepthCamera(NamedTuple):
+    """What is mapped: a topic of depth images, its messages, the cameras that took them, and their poses by
+    the frames of the images."""
+
+    depth: DepthTopic
+    sensor: BagSensor
+    cameras: "BagCameras"
+    poses: dict[str, BagPoses]
+
+
+def find_depth_camera(reader: TopicSource, choice: DepthChoice, options: ReadOptions) -> DepthCamera:
+    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
+    text names the source and lists the candidates."""
+    depth = choose_depth(reader, choice.depth)
+    sensor = find_sensor(reader, depth.name, "images", choice)
+    cameras = find_cameras(sensor, depth, choice.info, options)
+    found = poses_of(sensor, choice)
+    if any(each.registered for each in found.values()):
+        raise DatasetError(
+            f"{reader.path}: the images of {depth.name} say that they are in {depth.frame}, the frame that "
+            "the poses are in: ?optical=FRAME names the camera's own"
+        )
+    return DepthCamera(depth, sensor, cameras, found)
 
 
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
@@ -192,6 +228,21 @@ class BagCameras:
 
         stated = {frame: [(s, of(each)) for s, each in found] for frame, found in self.by_frame.items()}
         return replace(self, by_frame=stated, first=of_image_size(self.first, size, turned))
+
+    def measured(
+        self, message: Any, entry: Entry, depth_scale: float | None, where: str
+    ) -> tuple[NDArray[np.float32], PinholeCamera]:
+        """The depths (H, W) of an image in metres, and the camera that took it. Raises DatasetError, which
+        begins with ``where``, if it is no depth or not of its camera's size."""
+        with naming(where):
+            depth_m = messages.depth_image(message, depth_scale)
+        camera = self.at(entry, depth_m.shape)
+        if depth_m.shape != camera.shape:
+            raise DatasetError(
+                f"{where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
+                f"the camera {camera.width} x {camera.height}"
+            )
+        return depth_m, camera
 
 
 def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:
@@ -248,7 +299,13 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
 
 
 def _frame_of_info(
-    reader: RosReader, depth: DepthTopic, name: str, frame: str, known: list[str], wanted: bool, several: bool
+    reader: TopicSource,
+    depth: DepthTopic,
+    name: str,
+    frame: str,
+    known: list[str],
+    wanted: bool,
+    several: bool,
 ) -> str:
     """The frame of the CameraInfo of images in a frame. Raises DatasetError if there is none."""
     if frame in known:
@@ -285,7 +342,7 @@ def _half_a_frame(entries: Sequence[Entry]) -> float:
 
 
 def _fitted(
-    reader: RosReader,
+    reader: TopicSource,
     depth: DepthTopic,
     name: str,
     entries: Sequence[Entry],
@@ -314,7 +371,7 @@ def _fitted(
     return cameras
 
 
-def _first_size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
+def _first_size(reader: TopicSource, depth: DepthTopic) -> tuple[int, int]:
     """(width, height) of a topic's first image."""
     with naming(f"{reader.path}: topic {depth.name}"):
         height, width = messages.depth_image(reader.first(depth.name), None).shape

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import header_ns
-from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.trajectories import RESTART_S
 
 _NEAR = 5
@@ -55,7 +55,7 @@ def _around(place: int, count: int) -> slice:
     return slice(max(0, place - _NEAR // 2), min(count, place + _NEAR // 2 + 1))
 
 
-def stamped(reader: RosReader, topic: str, what: str) -> tuple[list[Entry], list[str]]:
+def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], list[str]]:
     """The messages of a sensor's topic with stamps that are right, and notes of those that were not. Data
     that are sent again with their stamp keep it."""
     entries: list[Entry] = []
@@ -98,7 +98,7 @@ def stamped(reader: RosReader, topic: str, what: str) -> tuple[list[Entry], list
     return [replace(entry, stamp=stamp) for entry, stamp, out in kept if not out], notes
 
 
-def _delay(reader: RosReader, topic: str) -> tuple[str, float]:
+def _delay(reader: TopicSource, topic: str) -> tuple[str, float]:
     """How much later than stamped messages are recorded, in seconds, and the topic that tells: CameraInfo
     beside ``topic``, tf or poses; "" and 0 if none does."""
     beside = topic.rpartition("/")[0]

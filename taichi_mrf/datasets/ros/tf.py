@@ -9,15 +9,16 @@ frame, or about its parent, leave it disputed; what passes through it asks the u
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -54,6 +55,20 @@ class TransformTree:
         self.disputed = dict(disputed or {})
         self.apart = tuple(apart)
         self._held: dict[str, Pose | None] = {}
+
+    def hear(
+        self, topic: str, entry: Entry, message: Any, moving: Collection[TimedPoses], keep_s: float
+    ) -> None:
+        """Add the transforms of a message that has just come to those of this tree's that are ``moving``, of
+        which the last ``keep_s`` seconds are kept."""
+        if namespace(topic) in self.apart:
+            return
+        for child, row in _sent_in(topic, entry, message):
+            parent, edge = self.edges.get(child, ("", None))
+            found = next((each for each in moving if each is edge), None)
+            if found is not None and parent == row.parent and np.isfinite(row.pose).all():
+                found.add(row.stamp or entry.stamp, row.pose, keep_s)
+                self._held.clear()
 
     def towards(self, *frames: str, named: bool = True) -> "TransformTree":
         """The tree in which a disputed frame has the parent that leads to one of some frames, if only one
@@ -173,9 +188,9 @@ class TransformTree:
     def _chain(self, frames: list[str], stamp: float, largest_gap: float) -> Pose | None:
         T = np.eye(4)
         for frame in frames:
-            step, edge = self._holds(frame), self.edges[frame][1]
-            if step is None and isinstance(edge, TimedPoses):
-                step = edge.at(stamp, largest_gap)
+            edge = self.edges[frame][1]
+            step = edge.at(stamp, largest_gap) if isinstance(edge, TimedPoses) else edge
+            step = self._holds(frame) if step is None else step
             if step is None:
                 return None
             T = step @ T
@@ -248,29 +263,39 @@ def tree_of(
     return TransformTree(edges, disputed, apart)
 
 
-def read_transforms(reader: RosReader) -> dict[str, Transforms]:
+def read_transforms(reader: TopicSource) -> dict[str, Transforms]:
     """Transforms that were sent in each namespace."""
     sent: dict[str, dict[str, list[tuple[_Sent, float]]]] = {}
     for topic in reader.topics.values():
         if topic.type not in messages.TF:
             continue
-        is_static = topic.name.endswith("tf_static")
-        transforms = sent.setdefault(topic.name.rpartition("/")[0], defaultdict(list))
+        transforms = sent.setdefault(namespace(topic.name), defaultdict(list))
         for entry, message in reader.messages(topic.name):
-            for each in message.transforms:
-                parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-                try:
-                    pose = as_pose(messages.pose_of(each))
-                except KeyframeError:
-                    pose = np.full((4, 4), np.nan)  # an uninitialised transform, which leaves a gap
-                stamp = messages.header_ns(each.header) / 1e9
-                if parent and child:
-                    row = _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
-                    transforms[child].append((row, entry.stamp))
+            for child, row in _sent_in(topic.name, entry, message):
+                transforms[child].append((row, entry.stamp))
     return {
         space: {child: _stamped(rows) for child, rows in transforms.items()}
         for space, transforms in sent.items()
     }
+
+
+def namespace(topic: str) -> str:
+    """The namespace of a topic of transforms: /robot1 of /robot1/tf."""
+    return topic.rpartition("/")[0]
+
+
+def _sent_in(topic: str, entry: Entry, message: Any) -> Iterator[tuple[str, _Sent]]:
+    """The transforms in a message, by the frames that they are of."""
+    is_static = topic.endswith("tf_static")
+    for each in message.transforms:
+        parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+        try:
+            pose = as_pose(messages.pose_of(each))
+        except KeyframeError:
+            pose = np.full((4, 4), np.nan)  # an uninitialised transform, which leaves a gap
+        stamp = messages.header_ns(each.header) / 1e9
+        if parent and child:
+            yield child, _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
 
 
 def _stamped(rows: Sequence[tuple[_Sent, float]]) -> list[_Sent]:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.datasets.ros.sources import TopicSource
+from taichi_mrf.errors import DatasetError, naming
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 FROM_TF = "tf"
@@ -33,28 +33,28 @@ class DepthTopic:
         return any(part.startswith("image_rect") for part in self.name.split("/"))
 
 
-def image_topics(reader: RosReader) -> list[DepthTopic]:
+def image_topics(reader: TopicSource) -> list[DepthTopic]:
     """The topics of images as their first messages show them."""
     return [described(reader, name) for name in topics_of(reader, *messages.IMAGES)]
 
 
-def topics_of(reader: RosReader, *types: str) -> list[str]:
+def topics_of(reader: TopicSource, *types: str) -> list[str]:
     """The topics with messages of some types."""
     return [topic.name for topic in reader.topics.values() if topic.type in types and topic.messages]
 
 
-def depth_topics(reader: RosReader) -> list[DepthTopic]:
+def depth_topics(reader: TopicSource) -> list[DepthTopic]:
     """The topics whose first message is a depth image (messages.is_depth)."""
     return [topic for topic in image_topics(reader) if messages.is_depth(topic.encoding, topic.name)]
 
 
-def packed_otherwise(reader: RosReader) -> list[str]:
+def packed_otherwise(reader: TopicSource) -> list[str]:
     """The topics of depth images that are packed in a way that is not read."""
     depth = (messages.MILLIMETRES[0], messages.METRES)
     return [t.name for t in image_topics(reader) if t.encoding.partition(";")[0].strip() in depth]
 
 
-def no_depth(reader: RosReader) -> str:
+def no_depth(reader: TopicSource) -> str:
     """Content of a bag without topics of depth images, and which of it might be read."""
     images = {topic.name: topic.encoding for topic in image_topics(reader)}
     held = [f"{t.name} ({images.get(t.name) or t.type.rpartition('/')[2]})" for t in reader.topics.values()]
@@ -73,18 +73,18 @@ def no_depth(reader: RosReader) -> str:
     return text
 
 
-def cloud_topics(reader: RosReader) -> list[str]:
+def cloud_topics(reader: TopicSource) -> list[str]:
     """The topics of point clouds."""
     return topics_of(reader, messages.POINT_CLOUD)
 
 
-def message_frame(reader: RosReader, topic: str) -> str:
+def message_frame(reader: TopicSource, topic: str) -> str:
     """The coordinate frame of a topic's first message, empty if there is none."""
     message = reader.first(topic)
     return "" if message is None else frame_name(message.header.frame_id)
 
 
-def described(reader: RosReader, name: str) -> DepthTopic:
+def described(reader: TopicSource, name: str) -> DepthTopic:
     """A topic of images as its first message shows it. Raises DatasetError, which names file and topic, if it
     has other messages or none."""
     topic = reader.topics[name]
@@ -97,7 +97,7 @@ def described(reader: RosReader, name: str) -> DepthTopic:
     return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name, frame))
 
 
-def _camera_topics(reader: RosReader, depth: str, frame: str) -> tuple[str, ...]:
+def _camera_topics(reader: TopicSource, depth: str, frame: str) -> tuple[str, ...]:
     """The CameraInfo topics of a depth topic: of those in its images' ``frame``, or of all if none is, those
     that share the longest beginning of their names with it. One is left in most bags, since drivers put
     camera_info beside the image."""
@@ -113,7 +113,7 @@ def _shared_parts(a: str, b: str) -> int:
     return next((i for i, (x, y) in enumerate(pairs) if x != y), min(a.count("/"), b.count("/")))
 
 
-def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
+def choose(reader: TopicSource, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
     """The topic that the user named, or the only candidate.
 
     Raises DatasetError, whose text names the file and lists the candidates, if the bag has no topic of that
@@ -135,3 +135,18 @@ def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str
         raise DatasetError(f"{path}: contains no {what}; its topics: {topics}")
     choices = ", ".join(f"{option}={name}" for name in candidates)
     raise DatasetError(f"{path}: contains several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
+
+
+def choose_depth(reader: TopicSource, wanted: str) -> DepthTopic:
+    """The topic of depth images that the user named, or the only one. Raises DatasetError, as choose, and if
+    its images are no depth that can be read."""
+    topics = {topic.name: topic for topic in depth_topics(reader)}
+    unread = [] if topics else packed_otherwise(reader)
+    if not (topics or unread or wanted):
+        raise DatasetError(f"{reader.path}: {no_depth(reader)}")
+    what = f"topics of depth images ({messages.ENCODINGS})"
+    name = choose(reader, "depth", wanted, [*topics, *unread], what)
+    topic = topics.get(name) or described(reader, name)
+    with naming(f"{reader.path}: topic {name}"):
+        messages.check_depth(topic.encoding)
+    return topic

@@ -1,0 +1,279 @@
+"""Foxglove's WebSocket protocol, as ``foxglove_bridge`` on a robot speaks it: the client's side.
+
+The server says in text frames of JSON which channels there are (``advertise``, ``unadvertise``); the client
+asks for those it wants (``subscribe``). A message is a binary frame: the byte 1, the number of the
+subscription (uint32), the time at which the server logged it (uint64, nanoseconds), all in little endian, and
+the message as ROS encodes it (https://github.com/foxglove/ws-protocol).
+
+A thread receives. Of images, which come faster than they can be mapped, the oldest that nobody has taken is
+dropped for a new one. A connection that is lost is made again, with the same topics.
+"""
+
+import json
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.decoding import CDR, LANGUAGES, ROS1, ros2_name
+from taichi_mrf.datasets.ros.sources import Channel
+from taichi_mrf.errors import DatasetError, said
+
+SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
+PORT = 8765
+BRIDGE = "ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
+
+MOST_IMAGES = 64
+"""Images that wait to be taken; two seconds of a camera, so that slow poses find theirs."""
+
+MOST_OTHERS = 100_000
+"""Other messages that wait to be taken: a quarter of an hour of tf at 100 Hz."""
+
+LARGEST = 1 << 28
+"""Bytes of a frame at most."""
+
+CONNECT_S = 5.0
+RETRY_S = 1.0
+
+_MESSAGE = struct.Struct("<BIQ")
+_MESSAGE_DATA = 1
+
+
+@dataclass(frozen=True)
+class Raw:
+    """A message as it came: its channel, when the server logged it, and its bytes."""
+
+    channel: Channel
+    logged_ns: int
+    data: bytes
+
+
+class FoxgloveClient:
+    """A connection to a server. ``channels`` are those that it has now by their topics, ``dropped`` counts
+    the images that nobody took in time; ``problem`` says why nothing comes while the connection is lost."""
+
+    def __init__(self, address: str) -> None:
+        """Connect to ``ws://host:port``; the scheme and the port may be missing. Raises DatasetError, which
+        names the address, if nobody listens there or another program does."""
+        self.address = _whole(address)
+        self.channels: dict[str, Channel] = {}
+        self.dropped, self.problem = 0, ""
+        self._wanted: set[str] = set()
+        self._subscribed: dict[int, Channel] = {}
+        self._numbers: dict[str, int] = {}
+        self._by_number: dict[int, str] = {}
+        self._images: deque[tuple[int, Raw]] = deque()
+        self._others: deque[tuple[int, Raw]] = deque(maxlen=MOST_OTHERS)
+        self._came, self._lock = 0, threading.Lock()
+        self._advertised, self._ended = threading.Event(), threading.Event()
+        self._connection = self._connect()
+        self._thread = threading.Thread(target=self._receive, name="foxglove", daemon=True)
+        self._thread.start()
+        if not self._advertised.wait(CONNECT_S):
+            self.close()
+            raise DatasetError(
+                f"{self.address}: a Foxglove server without topics: nothing is published there, or its "
+                "topic_whitelist leaves out all"
+            )
+
+    def subscribe(self, topics: Collection[str]) -> None:
+        """Ask for the messages of these topics and of no others, also of those that are advertised later."""
+        with self._lock:
+            gone = [number for number, each in self._subscribed.items() if each.topic not in topics]
+            self._wanted = set(topics)
+            for number in gone:
+                del self._subscribed[number]
+            new = self._unsubscribed()
+        if gone:
+            self._send({"op": "unsubscribe", "subscriptionIds": gone})
+        self._send_subscribe(new)
+
+    def take(self) -> list[Raw]:
+        """The messages that have come since the last call, in the order in which they came."""
+        with self._lock:
+            found = sorted([*self._images, *self._others], key=lambda each: each[0])
+            self._images.clear()
+            self._others.clear()
+        return [raw for _, raw in found]
+
+    def close(self) -> None:
+        """End the connection."""
+        self._ended.set()
+        self._connection.close()
+
+    def _connect(self) -> ClientConnection:
+        where = f"{self.address}:"
+        try:
+            connection = connect(
+                self.address,
+                subprotocols=SUBPROTOCOLS,
+                open_timeout=CONNECT_S,
+                close_timeout=1.0,
+                max_size=LARGEST,
+                compression=None,
+            )
+        except ConnectionRefusedError as error:
+            raise DatasetError(f"{where} nobody listens there: start '{BRIDGE}' on the robot") from error
+        except TimeoutError as error:
+            raise DatasetError(
+                f"{where} no answer within {CONNECT_S:g} s: is the robot on, in this network, its port open?"
+            ) from error
+        except socket.gaierror as error:
+            host = urlsplit(self.address).hostname
+            raise DatasetError(f"{where} no machine is called {host}: try its IP address") from error
+        except (InvalidHandshake, EOFError) as error:
+            raise DatasetError(f"{where} {_another(said(error))}") from error
+        except (OSError, InvalidURI, ValueError) as error:
+            raise DatasetError(f"{where} cannot be reached: {said(error)}") from error
+        if connection.subprotocol is None:
+            connection.close()
+            raise DatasetError(f"{where} {_another('it does not speak foxglove.sdk.v1')}")
+        return connection
+
+    def _receive(self) -> None:
+        while not self._ended.is_set():
+            try:
+                for frame in self._connection:
+                    self._take_in(frame)
+                why = "the server has closed the connection"
+            except ConnectionClosed as error:
+                why = said(error)
+            except Exception as error:  # whatever a damaged frame leads to
+                why = f"a frame cannot be read: {said(error)}"
+            if not self._ended.is_set():
+                self._connect_again(f"the connection is lost ({why})")
+
+    def _connect_again(self, why: str) -> None:
+        self.problem = f"{self.address}: {why}; trying again"
+        self._connection.close()
+        with self._lock:
+            self._subscribed.clear()
+            self._by_number.clear()
+            self.channels = {}
+        while not self._ended.wait(RETRY_S):
+            try:
+                self._connection = self._connect()
+            except DatasetError as error:
+                self.problem = f"{error}; trying again"
+                continue
+            self.problem = ""
+            if self._ended.is_set():  # closed while it was made
+                self._connection.close()
+            return
+
+    def _take_in(self, frame: str | bytes) -> None:
+        if isinstance(frame, str):
+            self._take_in_words(json.loads(frame))
+            return
+        if len(frame) < _MESSAGE.size or frame[0] != _MESSAGE_DATA:
+            return  # the server's time, or an answer that was not asked for
+        _, number, logged_ns = _MESSAGE.unpack_from(frame)
+        with self._lock:
+            channel = self._subscribed.get(number)
+            if channel is None:
+                return
+            self._came += 1
+            raw = self._came, Raw(channel, logged_ns, frame[_MESSAGE.size :])
+            if channel.type not in messages.IMAGES:
+                self._others.append(raw)
+                return
+            self._images.append(raw)
+            if len(self._images) > MOST_IMAGES:
+                self._images.popleft()
+                self.dropped += 1
+
+    def _take_in_words(self, words: dict[str, Any]) -> None:
+        if words.get("op") == "advertise":
+            with self._lock:
+                for each in words["channels"]:
+                    channel = _channel(each)
+                    self.channels[channel.topic] = channel
+                    self._by_number[each["id"]] = channel.topic
+                    self._numbers[channel.topic] = each["id"]
+                new = self._unsubscribed()
+            if self.channels:
+                self._advertised.set()
+            self._send_subscribe(new)
+        elif words.get("op") == "unadvertise":
+            with self._lock:
+                for number in words["channelIds"]:
+                    topic = self._by_number.pop(number, "")
+                    if self._numbers.get(topic) == number:
+                        self.channels.pop(topic, None)
+                        self._subscribed.pop(number, None)
+
+    def _unsubscribed(self) -> list[int]:
+        """Note the wanted channels that are there as subscribed to, by their numbers, which serve for the
+        subscriptions, too; returns those that were not."""
+        new = [
+            self._numbers[topic]
+            for topic in sorted(self._wanted & set(self.channels))
+            if self._numbers[topic] not in self._subscribed
+        ]
+        self._subscribed |= {number: self.channels[self._by_number[number]] for number in new}
+        return new
+
+    def _send_subscribe(self, numbers: list[int]) -> None:
+        if numbers:
+            wanted = [{"id": number, "channelId": number} for number in numbers]
+            self._send({"op": "subscribe", "subscriptions": wanted})
+
+    def _send(self, words: dict[str, Any]) -> None:
+        with suppress(ConnectionClosed):  # the thread connects again, and subscribes
+            self._connection.send(json.dumps(words))
+
+
+def wait_until(done: Callable[[], bool], seconds: float, step_s: float = 0.01) -> bool:
+    """Wait until ``done()``, for some seconds at most; returns whether it is."""
+    end = time.monotonic() + seconds
+    while not done():
+        if time.monotonic() >= end:
+            return False
+        time.sleep(step_s)
+    return True
+
+
+def _channel(words: dict[str, Any]) -> Channel:
+    """A channel as it is advertised. The definition of a language in binary, such as protobuf's, is not
+    read."""
+    encoding, kind = str(words["encoding"]), str(words.get("schemaName", ""))
+    language = str(words.get("schemaEncoding", "")) or {CDR: "ros2msg", ROS1: "ros1msg"}.get(encoding, "")
+    return Channel(
+        str(words["topic"]),
+        ros2_name(kind) if encoding == ROS1 else kind,
+        encoding,
+        LANGUAGES.get(language, "NONE"),
+        str(words.get("schema", "")),
+    )
+
+
+def _another(why: str) -> str:
+    return (
+        f"another program listens there, no Foxglove server ({why}): '{BRIDGE}' starts one, "
+        f"on port {PORT} (rosbridge, on 9090, speaks another protocol)"
+    )
+
+
+def _whole(address: str) -> str:
+    """An address with its scheme and port. Raises DatasetError if it is none."""
+    text = address or "localhost"
+    text = text if "://" in text else f"ws://{text}"
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise DatasetError(f"foxglove:{address}: {said(error)}; an address is ws://HOST:{PORT}") from error
+    if parts.scheme not in ("ws", "wss") or not host:
+        raise DatasetError(f"foxglove:{address}: is no address of a server: it is written ws://HOST:{PORT}")
+    return text if port else f"{parts.scheme}://{parts.netloc.rstrip(':')}:{PORT}{parts.path}"

@@ -1,0 +1,212 @@
+"""Robots that run, mapped as the bag of what they send would be: frames, poses, choices, and what is said."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+from inputs_bags import (
+    COUNT,
+    FRAME,
+    TOPIC,
+    Bag,
+    Kind,
+    images,
+    mounted,
+    moving_tf,
+    odometry,
+    plain,
+    stamp,
+    stamped_poses,
+    steps,
+    write_bag,
+)
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.datasets.wires import robot as wired
+from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import look_at
+
+pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+
+from foxglove_robot import Robot, robot
+
+SECONDS = 20
+Part = Callable[[Bag], object]
+Begin = Callable[..., Any]
+
+
+@pytest.fixture
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
+    """Opens a robot that sends its ``first`` messages while it is listened to. Returns the robot, the dataset
+    and the bag of all that it sends."""
+    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
+    monkeypatch.setattr(wired, "DECIDE_S", 0.3)
+    with ExitStack() as stack:
+
+        def begin_one(
+            *parts: Part, query: str = "", first: int = 1000, kind: Kind = "mcap"
+        ) -> tuple[Robot, Dataset, Path]:
+            bag = write_bag(tmp_path, *parts, kind=kind)
+            sender = stack.enter_context(robot(bag))
+
+            def send() -> None:
+                sender.wait_for("/tf_static")
+                sender.send_next(first)
+
+            thread = Thread(target=send)
+            thread.start()
+            try:
+                return sender, open_dataset(sender.source + query, color=False), bag
+            finally:
+                thread.join()
+
+        yield begin_one
+
+
+def compressed(bag: Bag, kind: str = "16UC1") -> None:
+    images(bag, numbers=())
+    for i in range(COUNT):
+        image = steps(i) if kind == "16UC1" else steps(i).astype(np.float32) / 1000
+        bag.compressed_depth(f"{TOPIC}/compressedDepth", stamp(i), FRAME, image, kind)
+
+
+def metres(i: int) -> np.ndarray:
+    return steps(i).astype(np.float32) / 1000
+
+
+BETWEEN = np.arange(-0.5, COUNT).tolist()
+"""Poses half a step before and after each image."""
+
+WAYS: dict[str, Part] = {
+    "odometry": partial(odometry, numbers=BETWEEN),
+    "tf": partial(moving_tf, numbers=BETWEEN),
+}
+IMAGES: dict[str, Part] = {
+    "16UC1": images,
+    "32FC1": partial(images, image=metres, encoding="32FC1"),
+    "compressedDepth of 16UC1": compressed,
+    "compressedDepth of 32FC1": partial(compressed, kind="32FC1"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("kind", IMAGES)
+def test_frames_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str, way: str) -> None:
+    sender, live, bag = begin(IMAGES[kind], mounted, WAYS[way], first=4)
+    recorded = open_dataset(bag, color=False)
+    assert live.endless
+    assert live.camera == recorded.camera
+    for number in range(COUNT):
+        assert wait_until(lambda number=number: came(live) == number + 1, SECONDS)
+        assert "the next image" in live.awaiting()  # the pose after it has not come
+        sender.send_next(1)
+        assert wait_until(lambda: not live.awaiting(), SECONDS)
+        sender.send_next(1)
+        ours, theirs = live.read(number), recorded.read(number)
+        assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
+        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def test_ros_1_is_read_too(begin: Begin) -> None:
+    _, live, bag = begin(plain, kind="ros1")
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    ours, theirs = live.read(0), open_dataset(bag, color=False).read(COUNT - 1)
+    np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+    np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def came(live: Dataset) -> int:
+    """Images that have come so far."""
+    live.awaiting()
+    while hasattr(live, "source"):
+        live = live.source
+    return live._came
+
+
+def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
+    _, live, _ = begin(plain)
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    assert live.read(0).name == f"{COUNT - 1:06d}"
+    assert f"{COUNT - 1} skipped, as mapping is slower" in live.awaiting()
+
+
+def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin) -> None:
+    sender, live, _ = begin(images, mounted, partial(odometry, numbers=range(COUNT - 1)))
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    assert live.read(0).name == f"{COUNT - 2:06d}"
+    assert "left out" not in live.awaiting()
+    static = next(data for topic, _, data in sender.messages if topic == "/tf_static")
+    later_ns = round(1e9 * (1_600_000_000 + stamp(COUNT) + wired.LATE_S + 1))
+    sender.channels["/tf_static"].log(static, log_time=later_ns)
+    assert wait_until(lambda: "1 left out: no poses within 0.1 s" in live.awaiting(), SECONDS)
+
+
+def test_a_robot_that_falls_silent_ends_what_waits_for_it(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender, live, _ = begin(plain)
+    live.read(0)
+    sender.stop()
+    monkeypatch.setattr(wired, "SILENCE_S", 0.5)
+    with pytest.raises(DatasetError, match=r"foxglove:ws://127.0.0.1:\d+: nothing to map for 0.5 s"):
+        live.read(1)
+    assert wait_until(lambda: "trying again" in live.awaiting(), SECONDS)
+
+
+def test_of_several_sources_of_poses_the_user_chooses(begin: Begin) -> None:
+    parts = (images, mounted, odometry, partial(stamped_poses, topic="/slam/pose"))
+    with pytest.raises(DatasetError, match=r"\?pose=/odom or \?pose=/slam/pose"):
+        begin(*parts)
+    _, live, _ = begin(*parts, query="?pose=/odom")
+    assert "poses in odom from /odom" in " ".join(live.notes)
+
+
+def test_without_camera_info_the_error_says_what_to_pass(begin: Begin) -> None:
+    with pytest.raises(DatasetError, match=r"contains no CameraInfo; pass --camera fx,fy,cx,cy"):
+        begin(partial(images, info=False), mounted, odometry)
+
+
+def test_topics_that_send_nothing_are_named(begin: Begin) -> None:
+    with pytest.raises(DatasetError, match=r"nothing came on .*/odom.* in \d+ s"):
+        begin(plain, first=0)
+
+
+def test_images_are_tracked_without_poses(begin: Begin) -> None:
+    _, live, _ = begin(images, mounted, query="?poses=track")
+    assert live.tracked
+    assert wait_until(lambda: not live.awaiting(), SECONDS)
+    live.read(0)
+
+
+def test_an_option_that_there_is_not_is_told() -> None:
+    with pytest.raises(DatasetError, match=r"foxglove:robot.*'?dept'?.*depth"):
+        open_dataset("foxglove:robot?dept=/camera")
+
+
+def test_poses_that_come_one_by_one_are_those_of_all() -> None:
+    rng = np.random.default_rng(0)
+    stamps = rng.permutation(np.arange(0.0, 5.0, 0.1))
+    poses = [look_at(rng.normal(size=3), rng.normal(size=3)) for _ in stamps]
+    grown = TimedPoses([], [])
+    for s, T in zip(stamps, poses, strict=True):
+        grown.add(s, T, 30.0)
+    whole = TimedPoses(stamps, poses)
+    np.testing.assert_array_equal(grown.stamps, whole.stamps)
+    np.testing.assert_array_equal(grown.poses, whole.poses)
+
+
+def test_old_poses_are_forgotten_and_a_clock_may_start_again() -> None:
+    grown = TimedPoses([], [])
+    for s in range(10):
+        grown.add(100.0 + s, np.eye(4), 3.0)
+    assert grown.stamps.tolist() == [106.0, 107.0, 108.0, 109.0]
+    grown.add(0.5, np.eye(4), 3.0)
+    assert grown.stamps.tolist() == [0.5]

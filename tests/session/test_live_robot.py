@@ -1,0 +1,150 @@
+"""A live run of a robot: its map is that of the bag of what it sent, and it outlives the connection."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+import small_room
+from inputs_bags import Bag, write_bag
+from live_scene import CONFIG, FakeLink, last_status, marginals, never
+
+from taichi_mrf.cli.main import main
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.wires import foxglove
+from taichi_mrf.datasets.wires import robot as wired
+from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.session.session import Session
+from taichi_mrf.session.session_core import Policy
+from taichi_mrf.session.source import open_source
+from taichi_mrf.viewer.messages import Request, Status, Update
+
+pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+
+from foxglove_robot import Robot, robot
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+SECONDS = 20
+COUNT = 5
+BEFORE = 3
+"""Messages before the first image: CameraInfo, a fixed transform, a pose."""
+
+
+def walk(bag: Bag) -> None:
+    """Frames of the small room, whose poses come half a step before and after each image."""
+    frames = small_room.frames()[:COUNT]
+    bag.camera_info("/camera/camera_info", "optical", frames[0].camera)
+    bag.tf("/tf_static", 0.0, "camera", "optical", np.eye(4))
+    bag.tf("/tf", 0.95, "map", "camera", frames[0].T_world_camera)
+    for i, frame in enumerate(frames):
+        bag.image("/camera/depth", 1 + 0.1 * i, "optical", frame.depth_m.astype(np.float32), "32FC1")
+        bag.tf("/tf", 1.05 + 0.1 * i, "map", "camera", frame.T_world_camera)
+
+
+@pytest.fixture
+def sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
+    """A robot that has sent its first image when it is opened."""
+    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
+    monkeypatch.setenv("COLUMNS", "200")
+    with robot(write_bag(tmp_path, walk, kind="mcap")) as found:
+        thread = Thread(target=partial(begin, found))
+        thread.start()
+        yield found
+        thread.join()
+
+
+def begin(sender: Robot) -> None:
+    sender.wait_for("/camera/depth", "/tf", "/tf_static")
+    sender.send_next(BEFORE + 1)
+
+
+def live(sender: Robot, link: FakeLink, limit: int) -> Session:
+    source, _ = open_source(sender.source, CONFIG, every=1, limit=limit, speed=0.0, loop=False)
+    return Session(source, link, Policy(leave_when_done=True))
+
+
+def waiting(doing: Callable[[], object]) -> Callable[[Update], Iterable[Request]]:
+    """Does something whenever the session waits for an image, until one is there."""
+
+    def react(update: Update) -> Iterable[Request]:
+        if isinstance(update, Status) and update.activity.startswith("waiting for the next image"):
+            doing()
+        return []
+
+    return react
+
+
+def test_a_robot_s_map_is_that_of_its_bag_bit_for_bit(sender: Robot) -> None:
+    link = FakeLink()
+    session = live(sender, link, COUNT)
+
+    def send() -> None:  # the pose after an image, and the image after that
+        sender.send_next(1)
+        assert wait_until(lambda: not session.state.replay.awaiting, SECONDS)
+        sender.send_next(1)
+
+    link._react = waiting(send)
+    session.run(never)
+    bag = open_dataset(sender.bag)
+    recorded = map_sequence(bag, with_recorded_noise(CONFIG, bag)).map
+    m = session.state.mapper.map
+    assert [k.name for k in m.keyframes.values()] == [k.name for k in recorded.keyframes.values()]
+    assert len(m.keyframes) == COUNT
+    assert marginals(m) == marginals(recorded)
+    assert link.errors() == []
+
+
+def test_a_run_goes_on_after_the_connection_was_lost(sender: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove, "RETRY_S", 0.05)
+    link, said = FakeLink(), []
+    session = live(sender, link, 2)
+    sender.send_next(1)
+    assert wait_until(lambda: not session.state.replay.awaiting, SECONDS)
+
+    def lose_and_find() -> None:
+        sender.stop()
+        assert wait_until(lambda: "trying again" in session.state.replay.awaiting, SECONDS)
+        said.append(session.state._idle_activity)
+        sender.start()
+        sender.wait_for("/camera/depth", "/tf")
+        sender.send_next(2)
+        assert wait_until(lambda: not session.state.replay.awaiting, SECONDS)
+
+    link._react = waiting(lose_and_find)
+    session.run(never)
+    assert f"waiting for the robot: ws://127.0.0.1:{sender.port}: " in said[0]
+    assert len(session.state.mapper.map.keyframes) == 2
+    assert last_status(link).finished
+    assert link.errors() == []
+
+
+def test_info_lists_topics_and_prints_the_command(sender: Robot, capsys: pytest.CaptureFixture[str]) -> None:
+    def send_all() -> None:
+        sender.wait_for("/camera/depth", "/tf", "/tf_static")
+        while not done.is_set():
+            sender.send()
+            done.wait(0.2)
+
+    done = Event()
+    thread = Thread(target=send_all)
+    thread.start()
+    try:
+        assert main(["info", sender.source]) == 0
+    finally:
+        done.set()
+        thread.join()
+    out = capsys.readouterr().out
+    for words in (
+        r"/camera/depth .* sensor_msgs/msg/Image .* depth, 32FC1, frame optical",
+        r"tf camera -> optical \(fixed\)",
+        r"tf map -> camera \(moving",
+        r"frames .* without end",
+    ):
+        assert re.search(words, out), words
+    assert out.strip().splitlines()[-1] == f"taichi-mrf live {sender.source}"
