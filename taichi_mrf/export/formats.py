@@ -22,10 +22,12 @@ from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.fused_surface import measured_surface
-from taichi_mrf.export.map_server import grey_image, level_map, write_map_server
+from taichi_mrf.export.map_server import LevelMap, grey_image, level_map, write_map_server
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
+from taichi_mrf.export.robot_messages import MapChannels, write_mcap
+from taichi_mrf.export.robot_messages import require_libraries as require_message_libraries
 from taichi_mrf.export.surface import Surface, photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
@@ -59,8 +61,9 @@ def export_map(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS
 
     ``m`` is any map, or a part of a chunked map (:func:`take_part`). The formats are ``.ply`` (points, or a
     mesh), ``.glb``, ``.obj`` and ``.stl`` (meshes), ``.bt`` and ``.ot`` (OctoMap), ``.pgm`` or ``.yaml`` (a
-    2D map for ROS), ``.npz`` (arrays), ``.html`` (a page that shows the map) and ``.zarr`` (chunks, for
-    :class:`ChunkedMap`). ``options`` are the formats' settings. A file is written completely or not at all.
+    2D map for ROS), ``.mcap`` (messages for Foxglove and ROS 2), ``.npz`` (arrays), ``.html`` (a page that
+    shows the map) and ``.zarr`` (chunks, for :class:`ChunkedMap`). ``options`` are the formats' settings. A
+    file is written completely or not at all.
 
     Returns the paths of the files written; a 2D map has two. Raises ArgumentTypeError if ``m`` is no map,
     ConfigError for an unknown extension and for options that do not fit the map, MapFileError if the file
@@ -96,6 +99,8 @@ def require_libraries(path: str | Path) -> None:
         library("zarr", "maps in chunks need", "store")
     elif writer is _surface:
         library("trimesh", f"{Path(path).suffix.lower()} files need", "mesh")
+    elif writer is _messages:
+        require_message_libraries(".mcap files need")
 
 
 def extensions() -> Sequence[str]:
@@ -144,7 +149,15 @@ def _plan_note(up: Up) -> str:
 def _points_or_surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes or options.mesh:
         return _surface(m, path, options)
-    m = m.decided
+    centres, p, sizes, colors = _points(m.decided, path, options)
+    write_voxels(path, centres, p, m.voxel_size, colors, sizes, m.config.volume.origin)
+    return [path]
+
+
+def _points(
+    m: VoxelMap, path: Path, options: ExportOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64], NDArray[np.uint8] | None]:
+    """Centres (n, 3), probabilities (n,), sizes (n,) and colours (n, 3) of voxels and cells, in metres."""
     centres, p = m.voxels(options.threshold)
     sizes = np.full(len(p), m.voxel_size)
     if options.cells:
@@ -153,9 +166,7 @@ def _points_or_surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[
         p = np.concatenate([p, *(each.probability for each in cells)])
         sizes = np.concatenate([sizes, *(np.full(len(each), each.side * m.voxel_size) for each in cells)])
     colored = _photo(m, path, options)
-    colors = None if colored is None else shown_colors(colored, centres)
-    write_voxels(path, centres, p, m.voxel_size, colors, sizes, m.config.volume.origin)
-    return [path]
+    return centres, p, sizes, None if colored is None else shown_colors(colored, centres)
 
 
 def _surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
@@ -205,11 +216,37 @@ def _octomap(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
 
 def _level_map(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     up = _up(m, options)
-    found = level_map(m.decided, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
+    found = _level(m.decided, options, up)
     image = grey_image(found.state == OCCUPIED, found.state != UNKNOWN)
     (x_m, y_m), (x, y), origin_m = found.lower_corner_m, found.axes, m.config.volume.origin
     corner_m = x_m + origin_m[x], y_m + origin_m[y]
     return write_map_server(path.parent, image, found.cell_size, corner_m, path.stem, _plan_note(up))
+
+
+def _level(decided: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
+    band = options.z_min, options.z_max, options.occupied_from, options.free_below
+    return level_map(decided, *band, up)
+
+
+def _messages(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
+    """Without a band of heights there is no costmap."""
+    keyframes = getattr(m, "keyframes", {}).values()
+    poses = {k.stamp_s: k.T_world_camera for k in keyframes}
+    stamp_s = max(poses, default=0.0)
+
+    def log(channels: MapChannels) -> None:
+        decided, up = m.decided, _up(m, options)
+        channels.octomap(decided, options.cells, stamp_s)
+        if options.z_min is not None or options.z_max is not None:
+            channels.costmap(_level(decided, options, up), up[1] * (options.z_min or 0.0), stamp_s)
+        channels.poses(poses)
+        channels.voxels(*_points(decided, path, options), stamp_s)
+        measured = _with_rays(m, path, options)
+        surface = smooth_surface(m, options.threshold) if measured is None else measured_surface(measured)
+        channels.surface(surface, stamp_s)
+
+    write_mcap(path, log)
+    return [path]
 
 
 def _arrays(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
@@ -241,6 +278,7 @@ _WRITERS: dict[str, Writer] = {
     ".stl": _surface,
     ".pgm": _level_map,
     ".yaml": _level_map,
+    ".mcap": _messages,
     ".npz": _arrays,
     ".html": _page,
     SUFFIX: _chunks,

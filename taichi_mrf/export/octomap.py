@@ -288,23 +288,29 @@ def write_ot(path: str | Path, m: VoxelMap, colored: VoxelMap | None = None, cel
     if colored is not None:
         records["color"] = channels(nodes.color)
     kind = "OcTree" if colored is None else "ColorOcTree"
-    _write(path, FULL_HEADER, nodes, m.voxel_size, records.tobytes(), kind)
+    _write(path, FULL_HEADER, len(nodes), m.voxel_size, records.tobytes(), kind)
 
 
 def write_bt(path: str | Path, m: VoxelMap, cells: bool = False) -> None:
     """Write which voxels are free and which occupied, the rest being unknown; ``cells`` as in
     :func:`write_ot`. Raises MapFileError, CapacityError."""
+    data, size = binary_octree(m, cells)
+    _write(path, BINARY_HEADER, size, m.voxel_size, data)
+
+
+def binary_octree(m: VoxelMap, cells: bool = False) -> tuple[bytes, int]:
+    """The nodes of a ``.bt``, as octomap_msgs/Octomap has them too, and their number. Raises
+    CapacityError."""
     nodes = octree_of(m, only_state=True, cells=cells)
-    inner = nodes.kinds[nodes.children != 0].astype("<u2")
-    _write(path, BINARY_HEADER, nodes, m.voxel_size, inner.tobytes())
+    return nodes.kinds[nodes.children != 0].astype("<u2").tobytes(), len(nodes)
 
 
 def _write(
-    path: str | Path, first_line: str, nodes: Nodes, voxel_size: float, data: bytes, kind: str = "OcTree"
+    path: str | Path, first_line: str, size: int, voxel_size: float, data: bytes, kind: str = "OcTree"
 ) -> None:
     header = (
         f"{first_line}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
-        f"id {kind}\nsize {len(nodes)}\nres {voxel_size:.9g}\ndata\n"
+        f"id {kind}\nsize {size}\nres {voxel_size:.9g}\ndata\n"
     )
     with atomic_path(path) as temporary:
         temporary.write_bytes(header.encode("ascii") + data)
