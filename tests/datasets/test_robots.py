@@ -1,5 +1,6 @@
 """Robots that run, mapped as the bag of what they send would be: frames, poses, choices, and what is said."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -7,10 +8,12 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import inputs_bags
 import numpy as np
 import pytest
 from inputs_bags import (
     COUNT,
+    EYE,
     FRAME,
     TOPIC,
     Bag,
@@ -138,15 +141,86 @@ def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> N
     assert f"{COUNT - 1} skipped, as mapping is slower" in live.awaiting()
 
 
-def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin) -> None:
+def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
     sender, live, _ = begin(images, mounted, partial(odometry, numbers=range(COUNT - 1)))
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
     assert live.read(0).name == f"{COUNT - 2:06d}"
     assert "left out" not in live.awaiting()
     static = next(data for topic, _, data in sender.messages if topic == "/tf_static")
-    later_ns = round(1e9 * (1_600_000_000 + stamp(COUNT) + wired.LATE_S + 1))
-    sender.channels["/tf_static"].log(static, log_time=later_ns)
-    assert wait_until(lambda: "1 left out: no poses within 0.1 s" in live.awaiting(), SECONDS)
+    monkeypatch.setattr(wired, "LATE_S", 0.1)
+
+    def is_left_out() -> bool:
+        sender.channels["/tf_static"].log(static)
+        return "1 left out: no poses within 0.1 s" in live.awaiting()
+
+    assert wait_until(is_left_out, SECONDS)
+
+
+LONG = range(20)
+"""Images of a walk that is longer than messages are ever out of order."""
+
+
+def long_walk(bag: Bag, T: np.ndarray = EYE) -> None:
+    images(bag, numbers=LONG)
+    mounted(bag)
+    odometry(bag, numbers=np.arange(-0.5, LONG.stop).tolist(), T=T)
+
+
+def test_where_time_jumps_back_poses_of_before_are_dropped(begin: Begin, tmp_path: Path) -> None:
+    sender, live, _ = begin(long_walk)
+    assert wait_until(lambda: came(live) == LONG.stop, SECONDS)
+    first = live.read(0)
+    assert live.arrivals().news == () or "jumped" not in " ".join(live.arrivals().news)
+    elsewhere = np.array([[1.0, 0, 0, 5], [0, 1, 0, -2], [0, 0, 1, 1], [0, 0, 0, 1]])
+    again = write_bag(tmp_path, partial(long_walk, T=elsewhere), kind="mcap")
+    with robot(again) as other:
+        sender.messages = other.messages
+    sender.send()
+    assert wait_until(lambda: came(live) == 2 * LONG.stop, SECONDS)
+    frame, recorded = live.read(1), open_dataset(again, color=False).read(LONG.stop - 1)
+    assert frame.name == f"{2 * LONG.stop - 1:06d}"
+    np.testing.assert_array_equal(frame.T_world_camera, recorded.T_world_camera)
+    np.testing.assert_array_equal(frame.depth_m, recorded.depth_m)
+    assert frame.stamp >= first.stamp  # the map's time never goes back
+    (said,) = [each for each in live.arrivals().news if "jumped back by 2.0 s" in each]
+    assert "poses of before are dropped, and mapping goes on" in said
+
+
+def test_stamps_of_another_clock_are_told_once_and_ages_count_from_arrival(begin: Begin) -> None:
+    def simulated(bag: Bag) -> None:
+        bag.send("/clock", "rosgraph_msgs/msg/Clock", 0.0, clock=bag.header(0.0, "").stamp)
+
+    _, live, _ = begin(plain, simulated)
+    assert live.arrivals().age_s is None
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    live.read(0)
+    found = live.arrivals()
+    assert len(found.news) == 1
+    assert f"stamps of {TOPIC} are " in found.news[0]
+    assert "days before this machine's clock: time is simulated or a bag's, by /clock" in found.news[0]
+    assert 0 <= found.age_s < 86400  # the stamps are of 2020
+
+
+def test_ages_are_those_of_stamps_where_clocks_agree(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = time.time()
+    monkeypatch.setattr(inputs_bags, "START", began - 2.0)
+    monkeypatch.setattr(wired, "CLOCKS_S", 600.0)
+    _, live, _ = begin(plain)
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    frame = live.read(0)
+    least = time.time() - frame.stamp
+    assert least - 0.01 <= live.arrivals().age_s <= time.time() - frame.stamp + 0.01
+    assert live.arrivals().news == ()
+
+
+def test_images_that_wait_for_poses_are_bounded(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wired, "MOST_IMAGES", 2)
+    _, live, _ = begin(images, mounted, partial(odometry, numbers=[-2, -1]))
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    while hasattr(live, "source"):
+        live = live.source
+    assert [image.number for image in live._waiting] == [COUNT - 2, COUNT - 1]
+    assert live.dropped == COUNT - 2
 
 
 def test_a_robot_that_falls_silent_ends_what_waits_for_it(
@@ -193,7 +267,7 @@ def test_an_option_that_there_is_not_is_told() -> None:
 
 def test_poses_that_come_one_by_one_are_those_of_all() -> None:
     rng = np.random.default_rng(0)
-    stamps = rng.permutation(np.arange(0.0, 5.0, 0.1))
+    stamps = np.concatenate([rng.permutation(part) for part in np.split(np.arange(0.0, 5.0, 0.1), 10)])
     poses = [look_at(rng.normal(size=3), rng.normal(size=3)) for _ in stamps]
     grown = TimedPoses([], [])
     for s, T in zip(stamps, poses, strict=True):

@@ -92,7 +92,7 @@ class BagPoses:
         """The time in seconds up to which poses are known: later ones have yet to come. A transform that came
         once, beside others that come again, does not move."""
         again = [each for each in self.moving if len(each) > 1] or self.moving
-        return min((float(each.stamps[-1]) for each in again), default=math.inf)
+        return min((float(each.stamps.max(initial=-math.inf)) for each in again), default=math.inf)
 
 
 def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:

@@ -4,7 +4,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import Decoder
@@ -13,8 +13,15 @@ from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.libraries import library
 
-Heard = tuple[Topic, Entry, Any]
-"""A message that has just come, decoded."""
+
+class Heard(NamedTuple):
+    """A message that has come, decoded, and when, on this machine's monotonic clock."""
+
+    topic: Topic
+    entry: Entry
+    message: Any
+    arrived_s: float
+
 
 DEPTH_NEEDS = (*messages.IMAGES, messages.CAMERA_INFO, *messages.TF, *messages.POSES)
 """The types of messages from which images of depth are mapped."""
@@ -33,7 +40,7 @@ class HeardTopics(TopicSource):
         self.broken: Counter[str] = Counter()
         self.problem = ""
         self._decoder = Decoder()
-        self._kept: dict[str, deque[tuple[Entry, Any]]] | None = {}
+        self._kept: dict[str, deque[Heard]] | None = {}
         self._learnt: set[Channel] = set()
         self._last: dict[str, Entry] = {}
         self._began = time.monotonic()
@@ -67,10 +74,10 @@ class HeardTopics(TopicSource):
             topic = self.topics[channel.topic]
             self._last[channel.topic] = entry
             self.topics[channel.topic] = topic = replace(topic, messages=topic.messages + 1)
+            found.append(Heard(topic, entry, message, raw.arrived_s))
             if self._kept is not None:
                 most = MOST_IMAGES if topic.type in messages.IMAGES else None
-                self._kept.setdefault(topic.name, deque(maxlen=most)).append((entry, message))
-            found.append((topic, entry, message))
+                self._kept.setdefault(topic.name, deque(maxlen=most)).append(found[-1])
         return found
 
     def forget(self) -> None:
@@ -79,7 +86,11 @@ class HeardTopics(TopicSource):
 
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
         """Those that are kept."""
-        return iter([] if self._kept is None else list(self._kept.get(topic, ())))
+        return ((each.entry, each.message) for each in self.kept(topic))
+
+    def kept(self, topic: str) -> list[Heard]:
+        """The messages of a topic that are kept."""
+        return [] if self._kept is None else list(self._kept.get(topic, ()))
 
     def read(self, topic: str, entry: Entry) -> Any:
         """One that is kept."""

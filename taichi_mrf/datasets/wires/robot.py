@@ -7,21 +7,25 @@ whose poses are known the newest is the next frame: where mapping is slower than
 skipped.
 """
 
+import math
 import time
 import weakref
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
-from taichi_mrf.datasets.base import Dataset, EndlessNames
+from taichi_mrf.datasets.base import Arrivals, Dataset, EndlessNames
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.bag import BagSummary, summary_of
-from taichi_mrf.datasets.ros.sensor import DepthCamera, DepthChoice, find_depth_camera
-from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry
+from taichi_mrf.datasets.ros.poses import BagPoses
+from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, DepthChoice, find_depth_camera
+from taichi_mrf.datasets.ros.sources import Entry
 from taichi_mrf.datasets.timed_poses import largest_gap
-from taichi_mrf.datasets.wires.foxglove import FoxgloveClient, wait_until
+from taichi_mrf.datasets.trajectories import RESTART_S
+from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient, wait_until
 from taichi_mrf.datasets.wires.heard import DEPTH_NEEDS, Heard, HeardTopics
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -36,31 +40,55 @@ DECIDE_S = 3.0
 LATE_S = 1.0
 """Poses come at most so much later than the largest gap allows; an image that has none by then gets none."""
 
+CLOCKS_S = 5.0
+"""Stamps that are further from when they arrive are of another clock, not late."""
+
+CLOCK = "/clock"
+"""The topic of simulated time."""
+
 SILENCE_S = 10.0
 """A robot that sends no image that can be mapped for so long has ended, for who waits for one."""
 
 ENDLESS = "a robot never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
+class Posed(NamedTuple):
+    """A message of the sensor: its number, what was heard, how much later than stamped it counts, as the
+    clock has started again, and T_world_camera, (4, 4), None while it waits for that."""
+
+    number: int
+    heard: Heard
+    later_s: float
+    pose: Pose | None = None
+
+
 @dataclass
 class Robot(Dataset):
-    """The depth images of a robot that runs. ``skipped`` counts those that were older than the newest,
-    ``dropped`` those without a pose."""
+    """The messages of one sensor of a robot that runs. ``load`` makes a frame of one, whose stamp and name it
+    is given. ``skipped`` counts those that were older than the newest, ``dropped`` those without a pose,
+    ``jumps`` how often the robot's time jumped back."""
 
     heard: HeardTopics = field(kw_only=True)
-    mapped: DepthCamera = field(kw_only=True)
-    depth_scale: float | None = None
+    sensor: BagSensor = field(kw_only=True)
+    poses: dict[str, BagPoses] = field(kw_only=True)
+    load: Callable[[Entry, Any, Pose, float, str], Frame] = field(kw_only=True)
     gap: float = 0.0
     skipped: int = 0
+    jumps: int = 0
 
     def __post_init__(self) -> None:
         self._came = 0
-        self._unposed: deque[tuple[int, Entry, Any]] = deque()
-        self._next: tuple[int, Entry, Any, Pose] | None = None
-        self._now_ns = 0
-        depth = self.heard.topics[self.mapped.depth.name]
-        for entry in self.mapped.sensor.entries:
-            self._take([(depth, entry, self.heard.read(depth.name, entry))])
+        self._waiting: deque[Posed] = deque()
+        self._next: Posed | None = None
+        self._newest_s = self._read_s = -math.inf
+        self._latest: tuple[float, float] | None = None  # the sensor's last stamp, and when it arrived
+        self._later_s = self._off_s = 0.0
+        self._news: dict[str, str] = {}  # said once of each subject
+        moving = [each for poses in self.poses.values() for each in poses.moving]
+        self._moving = list({id(each): each for each in moving}.values())
+        kept = {(e.entry.recorded_ns, e.entry.ordinal): e for e in self.heard.kept(self.sensor.topic)}
+        entries = self.sensor.entries  # whose stamps are mended
+        self._take([kept[e.recorded_ns, e.ordinal]._replace(entry=e) for e in entries])
         self.heard.forget()
 
     @property
@@ -80,11 +108,20 @@ class Robot(Dataset):
             return ""
         if self.heard.client.problem:
             return f"the robot: {self.heard.client.problem}"
-        skipped, dropped = self.skipped + self.heard.client.dropped, self.dropped
+        skipped = self.skipped + self.heard.client.dropped[self.sensor.topic]
         counted = [f"{skipped} skipped, as mapping is slower"] if skipped else []
-        counted += [f"{dropped} left out: no poses within {self.gap:g} s on both sides"] if dropped else []
+        counted += [f"{self.dropped} left out: no poses within {self.gap:g} s on both sides"] * (
+            self.dropped > 0
+        )
+        counted += [f"time has jumped back {self.jumps} times"] if self.jumps > 1 else []
         counted += [self.heard.problem] if self.heard.problem else []
         return f"the next image of {self._came}" + (f" ({'; '.join(counted)})" if counted else "")
+
+    def arrivals(self) -> Arrivals:
+        """The rate of the sensor; the age is that by stamps, or where the clocks differ, since it came."""
+        age_s = time.monotonic() - self._read_s + (self._off_s if abs(self._off_s) <= CLOCKS_S else 0.0)
+        rate_hz = self.heard.client.rate_hz(self.sensor.topic)
+        return Arrivals(rate_hz, None if math.isinf(age_s) else max(0.0, age_s), tuple(self._news.values()))
 
     def read(self, index: int) -> Frame:
         """The newest image with a pose, whatever the index. Raises DatasetError if none comes for SILENCE_S
@@ -93,40 +130,106 @@ class Robot(Dataset):
             why = f"nothing to map for {SILENCE_S:g} s: waiting for {self.awaiting()}"
             raise DatasetError(f"{self.heard.path}: {why}")
         assert self._next is not None
-        number, entry, message, T_world_camera = self._next
-        self._next = None
-        where = f"{self.heard.path}: topic {self.mapped.depth.name}"
+        (number, (_, entry, message, arrived_s), later_s, pose), self._next = self._next, None
+        assert pose is not None
+        self._compare_clocks(entry.stamp, arrived_s)
         try:
-            depth_m, camera = self.mapped.cameras.measured(message, entry, self.depth_scale, where)
+            return self.load(entry, message, pose, entry.stamp + later_s, f"{number:06d}")
         except DatasetError as error:
             raise FrameError(f"frame {number:06d}: {error}") from error
-        return Frame(depth_m, T_world_camera, camera, entry.stamp, f"{number:06d}")
+
+    def _compare_clocks(self, stamp: float, arrived_s: float) -> None:
+        """Note when an image arrived, and how far its stamp is from that; say it if it is no delay."""
+        self._read_s = arrived_s
+        self._off_s = time.time() - (time.monotonic() - arrived_s) - stamp
+        if abs(self._off_s) <= CLOCKS_S:
+            return
+        why = "a clock is wrong, time is simulated, or a bag is played"
+        if CLOCK in self.heard.client.channels:
+            why = f"time is simulated or a bag's, by {CLOCK}"
+        side = "before" if self._off_s > 0 else "after"
+        off = f"{_in_words(abs(self._off_s))} {side} this machine's clock"
+        said = f"the stamps of {self.sensor.topic} are {off}: {why}; ages are counted from when images come"
+        self._news.setdefault("clocks", said)
 
     def _take(self, heard: Sequence[Heard]) -> None:
         """Take what has come: images wait for their poses."""
-        for topic, entry, message in heard:
-            self._now_ns = max(self._now_ns, entry.recorded_ns)
-            if topic.name == self.mapped.depth.name:
-                self._unposed.append((self._came, entry, message))
-                self._came += 1
-            else:
-                for poses in self.mapped.poses.values():
-                    poses.hear(topic, entry, message)
-        while self._unposed and self._is_decided(self._unposed[0][1]):
-            number, entry, message = self._unposed.popleft()
-            pose = self.mapped.poses[entry.frame].at(entry.stamp, self.gap)
+        for each in heard:
+            self._newest_s = max(self._newest_s, each.arrived_s)
+            if each.topic.name == self.sensor.topic:
+                self._take_image(each)
+                continue
+            restarts = [edge.restarts for edge in self._moving]
+            for poses in self.poses.values():
+                poses.hear(each.topic, each.entry, each.message)
+            for edge, before in zip(self._moving, restarts, strict=True):
+                if edge.restarts > before:
+                    self._begin_again(float(edge.stamps[-1]), each.arrived_s)
+        while self._waiting and self._is_decided(self._waiting[0]):
+            image = self._waiting.popleft()
+            entry = image.heard.entry
+            pose = self.poses[entry.frame].at(entry.stamp, self.gap) if entry.frame in self.poses else None
             if pose is None:
                 self.dropped += 1
                 continue
             self.skipped += self._next is not None
-            self._next = number, entry, message, pose
+            self._next = image._replace(pose=pose)
 
-    def _is_decided(self, entry: Entry) -> bool:
+    def _take_image(self, heard: Heard) -> None:
+        stamp = heard.entry.stamp
+        self._begin_again(stamp, heard.arrived_s)
+        self._latest = max(stamp, self._latest[0] if self._latest else stamp), heard.arrived_s
+        self._waiting.append(Posed(self._came, heard, self._later_s))
+        self._came += 1
+        if len(self._waiting) > MOST_IMAGES:
+            self._waiting.popleft()
+            self.dropped += 1
+
+    def _begin_again(self, stamp: float, arrived_s: float) -> None:
+        """If the robot's time has jumped back, to a ``stamp``, drop the poses and images of before. The map's
+        time goes on by as much as has passed here."""
+        if self._latest is None or stamp >= self._latest[0] - RESTART_S:
+            return
+        (latest, at_s), end = self._latest, stamp + RESTART_S
+        for edge in self._moving:
+            edge.forget_after(end)
+        kept = [image for image in self._waiting if image.heard.entry.stamp <= end]
+        self.dropped += len(self._waiting) - len(kept)
+        self._waiting = deque(kept)
+        self._later_s += latest + max(0.0, arrived_s - at_s) - stamp
+        self._latest = stamp, arrived_s
+        self.jumps += 1
+        by = _in_words(latest - stamp)
+        self._news.setdefault(
+            "jump",
+            f"the robot's time has jumped back by {by}, as of a bag that is played again or a simulation "
+            "that starts again: the poses of before are dropped, and mapping goes on",
+        )
+
+    def _is_decided(self, image: Posed) -> bool:
         """True if the poses around an image have come, or will not come any more."""
-        poses = self.mapped.poses.get(entry.frame)
+        _, entry, _, arrived_s = image.heard
+        poses = self.poses.get(entry.frame)
         if poses is None or entry.stamp <= poses.until:
             return True
-        return self._now_ns - entry.recorded_ns > (self.gap + LATE_S) * NANOSECONDS
+        return self._newest_s - arrived_s > self.gap + LATE_S
+
+
+def _in_words(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.1f} s"
+
+
+def _depth_frame(
+    mapped: DepthCamera, depth_scale: float | None, where: str,
+    entry: Entry, message: Any, pose: Pose, stamp: float, name: str,
+) -> Frame:  # fmt: skip
+    """The frame of an image of depth."""
+    depth_m, camera = mapped.cameras.measured(message, entry, depth_scale, where)
+    return Frame(depth_m, pose, camera, stamp, name)
 
 
 def open_foxglove(text: str, options: ReadOptions) -> Dataset:
@@ -196,8 +299,9 @@ def _open(heard: HeardTopics, chosen: DepthChoice, options: ReadOptions) -> Robo
         distortion=mapped.cameras.distortion,
         tracked=chosen.poses == TRACK,
         heard=heard,
-        mapped=mapped,
-        depth_scale=options.depth_scale,
+        sensor=mapped.sensor,
+        poses=mapped.poses,
+        load=partial(_depth_frame, mapped, options.depth_scale, f"{heard.path}: topic {mapped.depth.name}"),
         gap=largest_gap(options),
     )
 
