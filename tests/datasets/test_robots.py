@@ -8,6 +8,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import bag_clouds
 import inputs_bags
 import numpy as np
 import pytest
@@ -129,9 +130,7 @@ def test_ros_1_is_read_too(begin: Begin) -> None:
 def came(live: Dataset) -> int:
     """Images that have come so far."""
     live.awaiting()
-    while hasattr(live, "source"):
-        live = live.source
-    return live._came
+    return whole(live)._came
 
 
 def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
@@ -217,10 +216,100 @@ def test_images_that_wait_for_poses_are_bounded(begin: Begin, monkeypatch: pytes
     monkeypatch.setattr(wired, "MOST_IMAGES", 2)
     _, live, _ = begin(images, mounted, partial(odometry, numbers=[-2, -1]))
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
-    while hasattr(live, "source"):
-        live = live.source
+    live = whole(live)
     assert [image.number for image in live._waiting] == [COUNT - 2, COUNT - 1]
     assert live.dropped == COUNT - 2
+
+
+def of_lidar(**more: np.ndarray) -> Part:
+    """Clouds, in which each point may have a ring and a time, of a lidar that drives and turns."""
+
+    def scans(bag: Bag) -> None:
+        for scan in range(bag_clouds.SCANS):
+            xyz = bag_clouds.points(scan)
+            if "ring" in more:
+                xyz = xyz.reshape(1, -1, 3)
+            bag_clouds.send(bag, bag_clouds.stamp(scan), xyz, **more)
+        bag_clouds.drive(bag)
+
+    return scans
+
+
+def in_the_world(bag: Bag, by_tf: bool) -> None:
+    """Clouds that an odometry has moved to the world's frame."""
+    for scan in range(bag_clouds.SCANS):
+        at = bag_clouds.stamp(scan)
+        T, xyz = bag_clouds.pose(at), bag_clouds.points(scan)
+        bag_clouds.send(bag, at, xyz @ T[:3, :3].T + T[:3, 3], frame="odom")
+    bag.tf("/tf_static", 0.0, "body", "lidar", EYE)
+    for i in range(8):
+        at = bag_clouds.stamp(0) - 0.05 + 0.05 * i
+        if by_tf:
+            bag.tf("/tf", at, "odom", "body", bag_clouds.pose(at))
+        else:
+            bag.odometry("/odom", at, "odom", "body", bag_clouds.pose(at))
+
+
+WIDTH = bag_clouds.CAMERA.shape[1]
+LIDARS: dict[str, Part] = {
+    "rows": of_lidar(),
+    "rows with times": of_lidar(t=np.tile(np.arange(WIDTH, dtype=np.uint32) * 3_400_000, (4, 1))),
+    "rings": of_lidar(ring=np.repeat(np.arange(4, dtype=np.uint16), WIDTH)[None]),
+    "free rays with times": of_lidar(
+        ring=np.zeros((1, 4 * WIDTH), np.uint16),
+        time=np.tile(np.linspace(-0.04, 0.04, WIDTH, dtype=np.float32), 4)[None],
+    ),
+    "moved to the world by odometry": partial(in_the_world, by_tf=False),
+    "moved to the world by tf": partial(in_the_world, by_tf=True),
+}
+
+
+@pytest.mark.parametrize("kind", LIDARS)
+def test_clouds_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> None:
+    sender, live, bag = begin(LIDARS[kind], first=5)
+    recorded, clouds = open_dataset(bag), whole(live)
+    assert (live.camera.shape, live.stated) == (recorded.camera.shape, recorded.stated)
+    assert set(recorded.notes) <= set(live.notes)
+    found = []
+    while sender.sent < len(sender.messages):
+        sender.send_next(1)
+        assert wait_until(lambda: heard_by(clouds) == sender.sent, SECONDS)
+        if not live.awaiting():
+            found.append(live.read(0))
+    assert len(found) == len(recorded) == bag_clouds.SCANS
+    for ours, theirs in zip(found, recorded, strict=True):
+        assert (ours.name, ours.stamp) == (theirs.name, theirs.stamp)
+        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+        np.testing.assert_array_equal(ours.no_return, theirs.no_return)
+        np.testing.assert_array_equal(ours.points_m, theirs.points_m)
+        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def whole(live: Dataset) -> wired.Robot:
+    """The robot behind what mends its frames."""
+    while hasattr(live, "source"):
+        live = live.source
+    assert isinstance(live, wired.Robot)
+    return live
+
+
+def heard_by(live: wired.Robot) -> int:
+    """Messages that have been heard so far."""
+    live.awaiting()
+    return sum(topic.messages for topic in live.heard.topics.values())
+
+
+def test_points_are_chosen_beside_images(begin: Begin) -> None:
+    def clouds(bag: Bag) -> None:
+        for scan in range(bag_clouds.SCANS):
+            bag_clouds.send(bag, stamp(scan), bag_clouds.points(scan))
+
+    parts = (plain, clouds, partial(mounted, child=bag_clouds.LIDAR, T=bag_clouds.T_BODY_LIDAR))
+    _, live, _ = begin(*parts, query="?points=/points")
+    assert "/points: images of 24 x 4 rays" in live.notes
+    assert live.camera.shape == bag_clouds.CAMERA.shape
+    _, live, _ = begin(*parts)
+    assert live.camera.shape == (12, 16)
 
 
 def test_a_robot_that_falls_silent_ends_what_waits_for_it(

@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from threading import Event, Thread
 
+import bag_clouds
 import numpy as np
 import pytest
 import small_room
@@ -70,11 +71,11 @@ def live(sender: Robot, link: FakeLink, limit: int) -> Session:
     return Session(source, link, Policy(leave_when_done=True))
 
 
-def waiting(doing: Callable[[], object]) -> Callable[[Update], Iterable[Request]]:
+def waiting(doing: Callable[[], object], what: str = "image") -> Callable[[Update], Iterable[Request]]:
     """Does something whenever the session waits for an image, until one is there."""
 
     def react(update: Update) -> Iterable[Request]:
-        if isinstance(update, Status) and update.activity.startswith("waiting for the next image"):
+        if isinstance(update, Status) and update.activity.startswith(f"waiting for the next {what}"):
             doing()
         return []
 
@@ -92,6 +93,53 @@ def test_a_robot_s_map_is_that_of_its_bag_bit_for_bit(sender: Robot) -> None:
 
     link._react = waiting(send)
     session.run(never)
+    bag = open_dataset(sender.bag)
+    recorded = map_sequence(bag, with_recorded_noise(CONFIG, bag)).map
+    m = session.state.mapper.map
+    assert [k.name for k in m.keyframes.values()] == [k.name for k in recorded.keyframes.values()]
+    assert len(m.keyframes) == COUNT
+    assert marginals(m) == marginals(recorded)
+    assert link.errors() == []
+
+
+def spin(bag: Bag) -> None:
+    """A spinning lidar in a sphere of 3 m, whose poses come half a scan before and after each cloud."""
+    bag.tf("/tf_static", 0.0, bag_clouds.BODY, bag_clouds.LIDAR, np.eye(4))
+    times = np.tile(np.arange(24, dtype=np.uint32) * 2_000_000, (4, 1))
+    bag.tf("/tf", 0.95, "map", bag_clouds.BODY, bag_clouds.pose(0.95))
+    for i in range(COUNT):
+        at = 1 + 0.1 * i
+        centre = bag_clouds.pose(at)[:3, 3]
+        rays = bag_clouds.CAMERA.rays()
+        along = rays @ (bag_clouds.pose(at)[:3, :3].T @ centre)
+        range_m = -along + np.sqrt(along**2 + 9.0 - centre @ centre)
+        bag_clouds.send(bag, at, rays * range_m[..., None], t=times)
+        bag.tf("/tf", at + 0.05, "map", bag_clouds.BODY, bag_clouds.pose(at + 0.05))
+
+
+def test_a_lidar_s_map_is_that_of_its_bag_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
+    with robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
+
+        def send_first() -> None:
+            sender.wait_for("/points", "/tf", "/tf_static")
+            sender.send_next(3)
+
+        thread = Thread(target=send_first)
+        thread.start()
+        link = FakeLink()
+        session = live(sender, link, COUNT)
+        thread.join()
+
+        def send() -> None:  # the pose after a cloud, and the cloud after that
+            sender.send_next(1)
+            assert wait_until(lambda: not session.state.replay.awaiting, SECONDS)
+            sender.send_next(1)
+
+        link._react = waiting(send, "cloud")
+        session.run(never)
     bag = open_dataset(sender.bag)
     recorded = map_sequence(bag, with_recorded_noise(CONFIG, bag)).map
     m = session.state.mapper.map

@@ -25,31 +25,27 @@ from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.images import note_of_largest
-from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
-from taichi_mrf.datasets.ros.lidar import LidarBag
+from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import (
     BagCameras,
-    DepthChoice,
+    SensorChoice,
     find_depth_camera,
-    find_sensor,
     posed_by,
-    poses_of,
     track_of,
 )
 from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
-    choose,
     cloud_topics,
     depth_topics,
     message_frame,
 )
-from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap
+from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -69,7 +65,7 @@ _LOOKED_AT = 4
 
 
 @dataclass(frozen=True)
-class BagOptions(DepthChoice):
+class BagOptions(SensorChoice):
     """The options after the name of a bag."""
 
     color: str = ""
@@ -81,13 +77,6 @@ class BagOptions(DepthChoice):
     imu: str = ""
     """The topic of an IMU whose angular rates help to track the camera (``poses=track``), by default the only
     one; ``none`` for tracking without."""
-
-    points: str = ""
-    """The topic of a lidar's point clouds, in place of depth images; of a bag without depth images by default
-    the only one."""
-
-    deskew: bool = True
-    """Undo the lidar's motion during a scan, where points have times."""
 
 
 @dataclass
@@ -192,7 +181,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
 
 
 def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Dataset:
-    if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
+    if maps_clouds(reader, chosen):
         return _open_lidar(reader, chosen, options)
     depth, sensor, cameras, found = find_depth_camera(reader, chosen, options)
     posed, notes = posed_by(sensor, found, options)
@@ -235,30 +224,18 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
 
 
 def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
-    refuse_image_options(f"{reader.path}", options)
-    topic = choose(reader, "points", chosen.points, cloud_topics(reader), "topics of point clouds")
-    if reader.topics[topic].type != messages.POINT_CLOUD:
-        raise DatasetError(
-            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {messages.POINT_CLOUD}"
-        )
-    sensor = find_sensor(reader, topic, "clouds", chosen)
-    found = poses_of(sensor, chosen)
-    tracked, registered = chosen.poses == TRACK, any(each.registered for each in found.values())
-    if tracked:
-        found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
+    sensor, found, clouds = find_clouds(reader, chosen, options)
+    tracked = chosen.poses == TRACK
     posed, notes = posed_by(sensor, found, options)
-    gap, deskews = largest_gap(options), chosen.deskew and not tracked and not registered
     bag = LidarBag(
         name=reader.path.stem,
         camera=RayTable([[1.0, 0.0, 0.0]]),
         notes=notes,
         dropped=len(sensor.entries) - len(posed),
         reader=reader,
-        topic=topic,
+        clouds=clouds,
         rows=_rows(reader, posed),
-        track=None if tracked or registered else track_of(found, options),
-        at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
-        registered=registered,
+        track=None if tracked or clouds.registered else track_of(found, options),
         tracked=tracked,
     )
     bag.look_at_first()

@@ -27,14 +27,21 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
-class DepthChoice(PoseChoice):
-    """How the images of depth and their poses are chosen."""
+class SensorChoice(PoseChoice):
+    """How the messages of a sensor and their poses are chosen."""
 
     depth: str = ""
     """The topic of depth images."""
 
     info: str = ""
     """The topic of their CameraInfo."""
+
+    points: str = ""
+    """The topic of a lidar's point clouds, in place of depth images; without depth images by default the only
+    one."""
+
+    deskew: bool = True
+    """Undo the lidar's motion during a scan, where points have times."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +168,7 @@ class DepthCamera(NamedTuple):
     poses: dict[str, BagPoses]
 
 
-def find_depth_camera(reader: TopicSource, choice: DepthChoice, options: ReadOptions) -> DepthCamera:
+def find_depth_camera(reader: TopicSource, choice: SensorChoice, options: ReadOptions) -> DepthCamera:
     """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
     text names the source and lists the candidates."""
     depth = choose_depth(reader, choice.depth)

@@ -205,7 +205,7 @@ class FoxgloveClient:
                 return
             self._came += 1
             raw = self._came, Raw(channel, logged_ns, time.monotonic(), frame[_MESSAGE.size :])
-            if channel.type not in messages.IMAGES:
+            if channel.type not in messages.OF_SENSORS:
                 self._others.append(raw)
                 return
             self._images.append(raw)

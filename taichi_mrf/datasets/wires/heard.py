@@ -23,8 +23,8 @@ class Heard(NamedTuple):
     arrived_s: float
 
 
-DEPTH_NEEDS = (*messages.IMAGES, messages.CAMERA_INFO, *messages.TF, *messages.POSES)
-"""The types of messages from which images of depth are mapped."""
+NEEDED = (*messages.OF_SENSORS, messages.CAMERA_INFO, *messages.TF, *messages.POSES)
+"""The types of messages from which images of depth and point clouds are mapped."""
 
 
 class HeardTopics(TopicSource):
@@ -76,7 +76,7 @@ class HeardTopics(TopicSource):
             self.topics[channel.topic] = topic = replace(topic, messages=topic.messages + 1)
             found.append(Heard(topic, entry, message, raw.arrived_s))
             if self._kept is not None:
-                most = MOST_IMAGES if topic.type in messages.IMAGES else None
+                most = MOST_IMAGES if topic.type in messages.OF_SENSORS else None
                 self._kept.setdefault(topic.name, deque(maxlen=most)).append(found[-1])
         return found
 

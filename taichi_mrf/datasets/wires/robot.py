@@ -16,17 +16,21 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from taichi_mrf.datasets.base import Arrivals, Dataset, EndlessNames
+from taichi_mrf.datasets.lidar.scans import LidarRecording, reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.bag import BagSummary, summary_of
+from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
-from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, DepthChoice, find_depth_camera
+from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
 from taichi_mrf.datasets.ros.sources import Entry
 from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.datasets.trajectories import RESTART_S
 from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient, wait_until
-from taichi_mrf.datasets.wires.heard import DEPTH_NEEDS, Heard, HeardTopics
+from taichi_mrf.datasets.wires.heard import NEEDED, Heard, HeardTopics
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
@@ -65,13 +69,14 @@ class Posed(NamedTuple):
 @dataclass
 class Robot(Dataset):
     """The messages of one sensor of a robot that runs. ``load`` makes a frame of one, whose stamp and name it
-    is given. ``skipped`` counts those that were older than the newest, ``dropped`` those without a pose,
-    ``jumps`` how often the robot's time jumped back."""
+    is given, and asks for poses up to a time, ``until``. ``skipped`` counts those that were older than the
+    newest, ``dropped`` those without a pose, ``jumps`` how often the robot's time jumped back."""
 
     heard: HeardTopics = field(kw_only=True)
     sensor: BagSensor = field(kw_only=True)
     poses: dict[str, BagPoses] = field(kw_only=True)
     load: Callable[[Entry, Any, Pose, float, str], Frame] = field(kw_only=True)
+    until: Callable[[Entry, Any], float] = lambda entry, message: entry.stamp
     gap: float = 0.0
     skipped: int = 0
     jumps: int = 0
@@ -115,7 +120,8 @@ class Robot(Dataset):
         )
         counted += [f"time has jumped back {self.jumps} times"] if self.jumps > 1 else []
         counted += [self.heard.problem] if self.heard.problem else []
-        return f"the next image of {self._came}" + (f" ({'; '.join(counted)})" if counted else "")
+        one = self.sensor.what.removesuffix("s")
+        return f"the next {one} of {self._came}" + (f" ({'; '.join(counted)})" if counted else "")
 
     def arrivals(self) -> Arrivals:
         """The rate of the sensor; the age is that by stamps, or where the clocks differ, since it came."""
@@ -149,7 +155,7 @@ class Robot(Dataset):
             why = f"time is simulated or a bag's, by {CLOCK}"
         side = "before" if self._off_s > 0 else "after"
         off = f"{_in_words(abs(self._off_s))} {side} this machine's clock"
-        said = f"the stamps of {self.sensor.topic} are {off}: {why}; ages are counted from when images come"
+        said = f"the stamps of {self.sensor.topic} are {off}: {why}; ages are counted from arrival"
         self._news.setdefault("clocks", said)
 
     def _take(self, heard: Sequence[Heard]) -> None:
@@ -208,11 +214,16 @@ class Robot(Dataset):
 
     def _is_decided(self, image: Posed) -> bool:
         """True if the poses around an image have come, or will not come any more."""
-        _, entry, _, arrived_s = image.heard
+        _, entry, message, arrived_s = image.heard
         poses = self.poses.get(entry.frame)
-        if poses is None or entry.stamp <= poses.until:
+        if poses is None or self.until(entry, message) <= poses.until:
             return True
         return self._newest_s - arrived_s > self.gap + LATE_S
+
+
+@dataclass
+class LidarRobot(Robot, LidarRecording):
+    """The point clouds of a robot that runs."""
 
 
 def _in_words(seconds: float) -> str:
@@ -236,7 +247,7 @@ def open_foxglove(text: str, options: ReadOptions) -> Dataset:
     """Connect to a robot: ``ADDRESS?option=value&...``. Raises DatasetError, which names the address, if it
     cannot be reached, and as a bag does if it is not clear what to map."""
     address, _, query = text.partition("?")
-    chosen = parse_options(DepthChoice, query, f"foxglove:{address}")
+    chosen = parse_options(SensorChoice, query, f"foxglove:{address}")
     if options.track:
         chosen = replace(chosen, poses=TRACK)
     heard = _connected(address)
@@ -253,7 +264,7 @@ def summarise(address: str) -> BagSummary:
     """What a robot sends, from a few seconds of listening. Raises DatasetError."""
     heard = _connected(address)
     try:
-        _listen(heard, _needed(heard, DepthChoice()))
+        _listen(heard, _needed(heard, SensorChoice()))
         return summary_of(heard)
     finally:
         heard.client.close()
@@ -268,12 +279,16 @@ def _connected(address: str) -> HeardTopics:
         raise
 
 
-def _needed(heard: HeardTopics, chosen: DepthChoice) -> list[str]:
-    """The topics that tell what is mapped; images of one topic only, if the user has named it."""
-    named = chosen.depth if chosen.depth in heard.topics else f"/{chosen.depth}"
-    images = [topic.name for topic in heard.topics.values() if topic.type in messages.IMAGES]
-    others = [topic.name for topic in heard.topics.values() if topic.type in DEPTH_NEEDS]
-    return [name for name in others if name not in images or not chosen.depth or name == named]
+def _needed(heard: HeardTopics, chosen: SensorChoice) -> list[str]:
+    """The topics that tell what is mapped; of images and clouds one only, if the user has named it."""
+    wanted = chosen.points or chosen.depth
+    named = wanted if wanted in heard.topics else f"/{wanted}"
+    return [
+        topic.name
+        for topic in heard.topics.values()
+        if topic.type in NEEDED
+        and (topic.type not in messages.OF_SENSORS or not wanted or topic.name == named)
+    ]
 
 
 def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
@@ -284,34 +299,83 @@ def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
         heard.hear()
 
 
-def _open(heard: HeardTopics, chosen: DepthChoice, options: ReadOptions) -> Robot:
+def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
     _listen(heard, _needed(heard, chosen))
-    mapped = _decided(heard, chosen, options)
-    kept = [mapped.depth.name]
+    robot = _decided(heard, chosen, options)
+    kept = [robot.sensor.topic]
     if chosen.poses != TRACK and not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
     heard.ask_for(kept)
-    notes = [*mapped.sensor.notes, *(note for each in mapped.poses.values() for note in each.notes)]
+    return robot
+
+
+def _parts(
+    heard: HeardTopics, sensor: BagSensor, poses: dict[str, BagPoses], options: ReadOptions
+) -> dict[str, Any]:
+    """The parts of a robot that are the same for all sensors."""
+    notes = [*sensor.notes, *(note for each in poses.values() for note in each.notes)]
+    return {
+        "name": str(heard.path),
+        "notes": [ENDLESS, *dict.fromkeys(notes)],
+        "heard": heard,
+        "sensor": sensor,
+        "poses": poses,
+        "gap": largest_gap(options),
+    }
+
+
+def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    mapped = find_depth_camera(heard, chosen, options)
+    parts = _parts(heard, mapped.sensor, mapped.poses, options)
+    parts["notes"] += mapped.cameras.notes
+    where = f"{heard.path}: topic {mapped.depth.name}"
     return Robot(
-        name=str(heard.path),
         camera=mapped.cameras.first,
-        notes=[ENDLESS, *dict.fromkeys(notes), *mapped.cameras.notes],
         distortion=mapped.cameras.distortion,
         tracked=chosen.poses == TRACK,
-        heard=heard,
-        sensor=mapped.sensor,
-        poses=mapped.poses,
-        load=partial(_depth_frame, mapped, options.depth_scale, f"{heard.path}: topic {mapped.depth.name}"),
-        gap=largest_gap(options),
+        load=partial(_depth_frame, mapped, options.depth_scale, where),
+        **parts,
     )
 
 
-def _decided(heard: HeardTopics, chosen: DepthChoice, options: ReadOptions) -> DepthCamera:
-    """What is mapped, as soon as enough has been heard to tell. Raises DatasetError."""
+def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    sensor, poses, clouds = find_clouds(heard, chosen, options)
+    parts = _parts(heard, sensor, poses, options)
+    first = _first_cloud(heard, sensor, poses, clouds, parts["gap"])
+    parts["notes"] += [clouds.in_words(first.camera)]
+    return LidarRobot(
+        camera=first.camera,
+        reach_m=reach_of(first.depth_m),
+        tracked=chosen.poses == TRACK,
+        load=clouds.frame,
+        until=clouds.until,
+        **parts,
+    )
+
+
+def _first_cloud(
+    heard: HeardTopics, sensor: BagSensor, poses: dict[str, BagPoses], clouds: Clouds, gap: float
+) -> Frame:
+    """The first cloud that can be read, if possible one with a pose: it tells rays and reach. Raises
+    DatasetError if there is none."""
+    problem: DatasetError | None = None
+    posed = [(entry, poses[entry.frame].at(entry.stamp, gap)) for entry in sensor.entries]
+    for entry, pose in sorted(posed, key=lambda each: each[1] is None):
+        try:
+            message = heard.read(sensor.topic, entry)
+            return clouds.frame(entry, message, np.eye(4) if pose is None else pose, entry.stamp, "")
+        except DatasetError as error:
+            problem = problem or error
+    raise DatasetError(f"{heard.path}: no cloud can be read: {problem}") from problem
+
+
+def _decided(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    """The robot, as soon as enough has been heard to tell what is mapped. Raises DatasetError."""
     end = time.monotonic() + DECIDE_S
     while True:
         try:
-            return find_depth_camera(heard, chosen, options)
+            find = _with_lidar if maps_clouds(heard, chosen) else _with_camera
+            return find(heard, chosen, options)
         except DatasetError as error:
             if time.monotonic() > end:
                 silent = [name for name in _needed(heard, chosen) if not heard.topics[name].messages]
