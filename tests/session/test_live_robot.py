@@ -17,7 +17,7 @@ from live_scene import CONFIG, FakeLink, last_status, marginals, never
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.datasets.wires import foxglove
+from taichi_mrf.datasets.wires import foxglove, stream
 from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.foxglove import wait_until
 from taichi_mrf.mapping.pipeline import map_sequence
@@ -235,7 +235,7 @@ def test_under_load_the_newest_image_is_mapped_at_its_own_pose(
     assert link.errors() == []
 
 
-def robots(session: Session) -> wired.Robot:
+def robots(session: Session) -> stream.Robot:
     """The robot behind what mends its frames."""
     dataset = session.state.source.dataset
     while hasattr(dataset, "source"):

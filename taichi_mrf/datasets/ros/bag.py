@@ -11,7 +11,7 @@ choose them.
 """
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds
-from taichi_mrf.datasets.ros.poses import pose_candidates
+from taichi_mrf.datasets.ros.poses import BagPoses, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import (
     BagCameras,
@@ -67,9 +67,6 @@ _LOOKED_AT = 4
 @dataclass(frozen=True)
 class BagOptions(SensorChoice):
     """The options after the name of a bag."""
-
-    color: str = ""
-    """The topic of colour images, by default the only one."""
 
     confidence: str = ""
     """The topic of images of confidence, by default the one beside that of depth."""
@@ -112,20 +109,13 @@ class RosBag(Table[BagRow]):
         """Take the poses for those of a body's axes, x ahead and z up, if neighbouring images agree clearly
         better so: names such as camera_link are used for both."""
         recorded = [self.pose(index) for index in range(len(self.rows))]
-        turned = [pose_of(T, Conventions(axes="ros")) for T in recorded]
-        found = [
-            gather(len(poses), poses.__getitem__, self._metres, self.camera, (1.0,)).disagreement
-            for poses in (recorded, turned)
-        ]
-        if all(found) and found[1][1.0] < min(_AGREE, 0.5 * found[0][1.0]):
+        said = by_body_axes(recorded, self._metres, self.camera, frame)
+        if said:
+            turned = [turned_axes(T) for T in recorded]
             self.rows = [replace(row, pose=T) for row, T in zip(self.rows, turned, strict=True)]
             if self.track is not None:
                 self.track = partial(_turned, self.track)
-            self.notes.append(
-                f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
-                f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
-                "?body=FRAME or ?optical=FRAME takes them as they are"
-            )
+            self.notes.append(said)
 
     def _metres(self, index: int) -> NDArray[np.float32]:
         message = self.reader.read(self.topic, self.rows[index].entry)
@@ -145,10 +135,40 @@ class RosBag(Table[BagRow]):
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
+def turned_axes(T: Pose) -> Pose:
+    """A pose of a body's axes, x ahead and z up, as that of the camera's."""
+    return pose_of(T, Conventions(axes="ros"))
+
+
+def may_be_body_axes(found: Mapping[str, BagPoses], chosen: SensorChoice, options: ReadOptions) -> bool:
+    """True if nothing says whether poses, by the frames of images, are of a camera's axes or a body's."""
+    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
+    stated = chosen.poses == TRACK or chosen.optical or chosen.body or options.conventions.of_poses
+    return doubtful and not stated
+
+
+def by_body_axes(
+    recorded: Sequence[Pose], metres: Callable[[int], NDArray[np.float32]], camera: PinholeCamera, frame: str
+) -> str:
+    """A note if the poses of images are clearly those of a body's axes: neighbouring images then agree much
+    better. ``metres`` reads an image. Empty if not."""
+    found = [
+        gather(len(poses), poses.__getitem__, metres, camera, (1.0,)).disagreement
+        for poses in (recorded, [turned_axes(T) for T in recorded])
+    ]
+    if not all(found) or found[1][1.0] >= min(_AGREE, 0.5 * found[0][1.0]):
+        return ""
+    return (
+        f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
+        f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
+        "?body=FRAME or ?optical=FRAME takes them as they are"
+    )
+
+
 def _turned(track: Callable[[], StampedPoses]) -> StampedPoses:
     """The poses of a body's axes as those of the camera's."""
     stamps, poses = track()
-    return stamps, [pose_of(T, Conventions(axes="ros")) for T in poses]
+    return stamps, [turned_axes(T) for T in poses]
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -217,8 +237,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         gyro=imu.gyro,
         acceleration=imu.acceleration,
     )
-    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
-    if doubtful and not (tracked or chosen.optical or chosen.body or options.conventions.of_poses):
+    if may_be_body_axes(found, chosen, options):
         bag.look_at_axes(depth.frame)
     return bag
 
