@@ -28,6 +28,7 @@ from websockets.typing import Subprotocol
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import CDR, LANGUAGES, ROS1, ros2_name
 from taichi_mrf.datasets.ros.sources import Channel
+from taichi_mrf.datasets.wires.schemas import JSON, PROTOBUF, ROS_TYPES
 from taichi_mrf.errors import DatasetError, said
 
 SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
@@ -266,9 +267,12 @@ def wait_until(done: Callable[[], bool], seconds: float, step_s: float = 0.01) -
 
 
 def _channel(words: dict[str, Any]) -> Channel:
-    """A channel as it is advertised. The definition of a language in binary, such as protobuf's, is not
-    read."""
+    """A channel as it is advertised. Of those in protobuf or JSON Foxglove's own types are read."""
     encoding, kind = str(words["encoding"]), str(words.get("schemaName", ""))
+    if encoding in (PROTOBUF, JSON) and kind in ROS_TYPES:
+        return Channel(
+            str(words["topic"]), ROS_TYPES[kind], encoding, "NONE", str(words.get("schema", "")), kind
+        )
     language = str(words.get("schemaEncoding", "")) or {CDR: "ros2msg", ROS1: "ros1msg"}.get(encoding, "")
     return Channel(
         str(words["topic"]),

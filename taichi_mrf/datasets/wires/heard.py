@@ -10,6 +10,7 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import Decoder
 from taichi_mrf.datasets.ros.sources import Channel, Entry, Topic, TopicSource, entry_of
 from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient
+from taichi_mrf.datasets.wires.schemas import SchemaDecoder
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.libraries import library
 
@@ -40,6 +41,7 @@ class HeardTopics(TopicSource):
         self.broken: Counter[str] = Counter()
         self.problem = ""
         self._decoder = Decoder()
+        self._own: dict[Channel, SchemaDecoder] = {}
         self._kept: dict[str, deque[Heard]] | None = {}
         self._learnt: set[Channel] = set()
         self._last: dict[str, Entry] = {}
@@ -63,7 +65,10 @@ class HeardTopics(TopicSource):
         for raw in self.client.take():
             channel = raw.channel
             try:
-                message = self._decoder.decode(channel.type, channel.encoding, raw.data)
+                if channel in self._own:
+                    message = self._own[channel].decode(raw.data)
+                else:
+                    message = self._decoder.decode(channel.type, channel.encoding, raw.data)
             except Exception as error:  # the library raises many kinds of errors
                 self.broken[channel.topic] += 1
                 self.problem = f"{self.path}: topic {channel.topic}: cannot be read: {said(error)}"
@@ -105,7 +110,13 @@ class HeardTopics(TopicSource):
         if not new:
             return
         self._learnt |= set(new)
-        for channel, problem in zip(new, self._decoder.learn(new), strict=True):
+        problems = dict(zip(new, self._decoder.learn(new), strict=True))
+        for channel in (each for each in new if each.schema):
+            try:
+                self._own[channel], problems[channel] = SchemaDecoder(channel), ""
+            except Exception as error:  # descriptors may be anything
+                problems[channel] = said(error)
+        for channel, problem in problems.items():
             kind = f"{channel.type} ({problem})" if problem else channel.type
             known = self.topics.get(channel.topic)
             self.topics[channel.topic] = Topic(channel.topic, kind, known.messages if known else 0)

@@ -239,6 +239,7 @@ def _decided(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> 
             if time.monotonic() > end:
                 silent = [name for name in _needed(heard, chosen) if not heard.topics[name].messages]
                 said = f"; nothing came on {', '.join(silent)} in {heard.duration:.0f} s" if silent else ""
+                said += f"; {heard.problem}" if heard.problem else ""
                 raise DatasetError(f"{error}{said}") from error
         time.sleep(0.1)
         heard.hear()
