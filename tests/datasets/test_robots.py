@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -281,7 +282,8 @@ LIDARS: dict[str, Part] = {
 def test_clouds_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> None:
     sender, live, bag = begin(LIDARS[kind], first=5)
     recorded = open_dataset(bag)
-    assert (live.camera.shape, live.stated) == (recorded.camera.shape, recorded.stated)
+    assert live.camera.shape == recorded.camera.shape
+    assert live.stated == replace(recorded.stated, swept_m=0.0)  # which is a note of reports
     assert set(recorded.notes) <= set(live.notes)
     found = one_by_one(sender, live)
     assert len(found) == len(recorded) == bag_clouds.SCANS

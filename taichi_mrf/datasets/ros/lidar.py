@@ -256,6 +256,19 @@ class LidarBag(LidarRecording, Table[BagRow]):
         lidar."""
         super().look_at_first(what)
         self.notes.append(self.clouds.in_words(self.camera))
+        if self.clouds.registered:
+            self.swept_m = 0.0
+        elif self.swept_m and self._has_times():
+            self.notes.append(
+                f"{self.clouds.topic}: the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at "
+                "10 m, which is not undone, though its points have times: leave out deskew=false"
+            )
+
+    def _has_times(self) -> bool:
+        """True if points of the first cloud have times that differ."""
+        entry = self.rows[0].entry
+        seconds = decode(self.reader.read(self.clouds.topic, entry), entry.stamp).seconds
+        return seconds is not None and bool(np.ptp(seconds[np.isfinite(seconds)]) > 0)
 
 
 @dataclass(frozen=True)
