@@ -93,6 +93,17 @@ class StatedSensor:
     """How far it moves, turns counted at 10 m, while it takes an image, where nothing undoes that."""
 
 
+@dataclass(frozen=True)
+class Arrivals:
+    """How the frames of a sensor that runs come: ``rate_hz``, and how old that which was read last is by now,
+    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since it was
+    opened."""
+
+    rate_hz: float
+    age_s: float | None
+    news: tuple[str, ...] = ()
+
+
 StampedPoses = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
 """Stamps in seconds, and the poses (4, 4) T_world_camera at them."""
 
@@ -144,6 +155,10 @@ class Dataset(ABC):
         """Look for the next frame of a source that never ends, and say what it waits for, in words; empty if
         the frame is there."""
         return ""
+
+    def arrivals(self) -> Arrivals | None:
+        """How the frames of a sensor that runs come, None for any other source."""
+        return None
 
     @property
     def stated(self) -> StatedSensor:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, StampedPoses, StatedSensor
+from taichi_mrf.datasets.base import Arrivals, Dataset, StampedPoses, StatedSensor
 from taichi_mrf.datasets.conventions import AS_USUAL, POSE_UNITS, Conventions
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -43,6 +43,10 @@ class Derived(Dataset):
     def awaiting(self) -> str:
         """What the source waits for."""
         return self.source.awaiting()
+
+    def arrivals(self) -> Arrivals | None:
+        """The source's."""
+        return self.source.arrivals()
 
     @property
     def stated(self) -> StatedSensor:

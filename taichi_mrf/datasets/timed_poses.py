@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.trajectories import read_trajectory, rotation_of, valid_poses
+from taichi_mrf.datasets.trajectories import RESTART_S, read_trajectory, rotation_of, valid_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 
@@ -115,12 +115,13 @@ class TimedPoses:
     """A trajectory that interpolates the pose at any time inside it.
 
     ``stamps`` (N,) float64 are seconds, ascending; ``poses`` (N, 4, 4) take points of the moving frame to the
-    fixed one.
+    fixed one. ``restarts`` counts how often the clock of poses that came one by one started again.
     """
 
     def __init__(self, stamps: Sequence[float] | NDArray, poses: Sequence[Pose] | NDArray) -> None:
         """Sort the poses by their stamps; of several with one stamp the last one given counts."""
         keys = np.asarray(stamps, np.float64)
+        self.restarts = 0
         order = np.argsort(keys, kind="stable")
         last = np.append(np.diff(keys[order]) > 0, True)[: len(order)]
         self.stamps: NDArray[np.float64] = keys[order][last]
@@ -131,12 +132,20 @@ class TimedPoses:
 
     def add(self, stamp: float, pose: Pose, keep_s: float) -> None:
         """Add a pose that has just come, and drop those that are more than ``keep_s`` seconds older than the
-        newest; all, if it is so much older itself, as of a clock that has started again."""
-        oldest = float(self.stamps.max(initial=stamp)) - keep_s
-        kept = (self.stamps >= oldest) & (stamp >= oldest)
+        newest; all, if it is older by more than a clock's restart."""
+        newest = float(self.stamps.max(initial=stamp))
+        again = stamp < newest - RESTART_S
+        self.restarts += again
+        kept = (self.stamps >= newest - keep_s) & (not again)
         stamps, poses = np.append(self.stamps[kept], stamp), np.append(self.poses[kept], pose[None], axis=0)
         merged = TimedPoses(stamps, poses)
         self.stamps, self.poses = merged.stamps, merged.poses
+
+    def forget_after(self, stamp: float) -> None:
+        """Drop the poses after a time, but for one that was sent once, which a robot may not send again."""
+        if len(self) > 1:
+            kept = self.stamps <= stamp
+            self.stamps, self.poses = self.stamps[kept], self.poses[kept]
 
     @property
     def stands_still(self) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.base import Arrivals
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
@@ -93,6 +94,10 @@ class Replay:
     def awaiting(self) -> str:
         """What a source that never ends waits for, in words."""
         return self._dataset.awaiting()
+
+    def arrivals(self) -> Arrivals | None:
+        """How the frames of a sensor that runs come, None for any other source."""
+        return self._dataset.arrivals()
 
     def set_speed(self, factor: float) -> None:
         """Change the speed from here on. Raises ConfigError if it is negative or not finite."""

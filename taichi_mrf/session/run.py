@@ -32,7 +32,7 @@ from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
 
 RATE_SECONDS = 5.0
-"""Seconds over which the keyframe rate is averaged."""
+"""Seconds over which the rates of keyframes and of frames are averaged."""
 
 
 PLAY_STEPS = 60
@@ -59,6 +59,7 @@ class Progress:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._taken: deque[float] = deque()
+        self._looked_at: deque[float] = deque()
         self._pace: deque[tuple[float, int]] = deque()  # frames that were read by some times
         self._begin = clock()
         self._measured: MapStatistics | None = None
@@ -66,6 +67,10 @@ class Progress:
     def keyframe_taken(self) -> None:
         """Count a keyframe for the rate."""
         self._taken.append(self._clock())
+
+    def frame_looked_at(self) -> None:
+        """Count a frame for the rate, whether or not it becomes a keyframe."""
+        self._looked_at.append(self._clock())
 
     def measure(self, mapper: Mapper) -> None:
         """Measure the map's size, which takes too long for every message."""
@@ -88,7 +93,7 @@ class Progress:
             replay.frames if replay else 0,
             states.count("on"),
             states.count("frozen"),
-            self._rate(),
+            self._rate(self._taken),
             self._measured.voxels,
             self._measured.bricks,
             self._measured.memory_mb,
@@ -99,6 +104,7 @@ class Progress:
             mapper.map.promise.sentence() if mapper.map.promise and mapper.map.settled else "",
             mapper.edits.can_undo,
             mapper.edits.can_redo,
+            self._arrivals(replay),
         )
 
     def time_left(self, replay: Replay) -> str:
@@ -116,11 +122,20 @@ class Progress:
             return ""
         return f", {in_words((now - since) * (replay.frames - done) / (done - first))} left"
 
-    def _rate(self) -> float:
+    def _arrivals(self, replay: Replay | None) -> str:
+        """In words, how many frames a sensor that runs sends, how many are looked at, and how long ago the
+        newest of these was taken; empty for any other source."""
+        arrivals = None if replay is None else replay.arrivals()
+        if arrivals is None:
+            return ""
+        age = "" if arrivals.age_s is None else f", the newest {arrivals.age_s:.1f} s ago"
+        return f"{arrivals.rate_hz:.1f}/s come, {self._rate(self._looked_at):.1f}/s are looked at{age}"
+
+    def _rate(self, times: deque[float]) -> float:
         now = self._clock()
-        while self._taken and self._taken[0] < now - RATE_SECONDS:
-            self._taken.popleft()
-        return len(self._taken) / max(min(RATE_SECONDS, now - self._begin), 1e-3)
+        while times and times[0] < now - RATE_SECONDS:
+            times.popleft()
+        return len(times) / max(min(RATE_SECONDS, now - self._begin), 1e-3)
 
 
 def sweeping(step: InferProgress) -> tuple[str, float]:
@@ -256,7 +271,18 @@ class Run(SessionCore):
     def show_activity(self, activity: str, share: float) -> None:
         """Show the present activity in the viewer, and the share of it that is done, 0 to 1."""
         waiting = self.waiting.has_edits()
+        self._tell_news()
         self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
+
+    def _tell_news(self) -> None:
+        """Tell the viewer, and note for the report, what has come about at a sensor that runs."""
+        arrivals, dataset = self.replay.arrivals() if self.replay else None, self.source.dataset
+        if arrivals is None or dataset is None:
+            return
+        for text in arrivals.news:
+            if text not in dataset.notes:
+                dataset.notes.append(text)
+                self.send(Notice(text, "warning"))
 
     def notice_error(self, error: Exception) -> None:
         """Tell the viewer what went wrong; a map that is full also pauses the replay."""

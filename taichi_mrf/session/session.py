@@ -182,6 +182,7 @@ class Session:
         state.show_activity(f"reading frame {replay.next_number}{of}", replay.share)
         with state.intake.result.timed("reading"):
             frame = replay.take()
+        state.progress.frame_looked_at()
         if frame is not None:
             state.guarded(lambda: self._offer(frame, replay))
         if replay.finished:

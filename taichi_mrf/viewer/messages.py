@@ -180,7 +180,8 @@ class Status(Update):
     """Progress and figures. ``activity`` says what is being done, ``share`` how much of it is done (0 to 1),
     ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
     pace (0: as fast as possible), None where frames have none. ``free_space`` says how sure free space is, if
-    frames were held out for that. ``can_undo``, ``can_redo``: edits can be taken back, or made again."""
+    frames were held out for that. ``can_undo``, ``can_redo``: edits can be taken back, or made again.
+    ``arrivals`` says how the frames of a sensor that runs come, empty for any other source."""
 
     activity: str
     share: float
@@ -199,6 +200,7 @@ class Status(Update):
     free_space: str = ""
     can_undo: bool = False
     can_redo: bool = False
+    arrivals: str = ""
 
 
 @dataclass(frozen=True)

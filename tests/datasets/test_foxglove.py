@@ -80,8 +80,8 @@ def test_the_oldest_images_are_dropped_and_nothing_else(
     found = client.take()
     images = [each.logged_ns for each in found if each.channel.topic == TOPIC]
     assert images == [time for topic, time, _ in walk.messages if topic == TOPIC][-2:]
-    assert client.dropped == sent[TOPIC] - 2
-    assert len(found) == len(walk.messages) - client.dropped + 1
+    assert client.dropped == {TOPIC: sent[TOPIC] - 2}
+    assert len(found) == len(walk.messages) - client.dropped[TOPIC] + 1
 
 
 def test_a_lost_connection_is_made_again_with_its_topics(

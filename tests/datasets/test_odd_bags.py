@@ -18,9 +18,11 @@ from inputs_bags import (
     BODY,
     CAMERA,
     COUNT,
+    EYES,
     FRAME,
     INFO,
     START,
+    T_LINK_CAMERA,
     TOPIC,
     Bag,
     Kind,
@@ -33,6 +35,7 @@ from inputs_bags import (
     moving_tf,
     odometry,
     plain,
+    seen,
     stamp,
     steps,
     world_body,
@@ -44,7 +47,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.ros.sensor import camera_of
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
 T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -384,17 +387,6 @@ def test_a_transform_that_is_sent_once_holds_where_another_moves(make: Make) -> 
     check_poses(open_dataset(make(images, mounted, once)))
     mounted_once = make(images, once, lambda bag: bag.tf("/tf", stamp(1), BODY, FRAME, T_body_camera))
     check_poses(open_dataset(mounted_once))
-
-
-T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
-
-
-def seen(i: int) -> np.ndarray:
-    """Millimetres of the walls of a box, 5 x 4 x 3 m, from inside."""
-    ways = CAMERA.rays() @ EYES[i][:3, :3].T
-    walls = (np.sign(ways) * [2.5, 2.0, 1.5] - EYES[i][:3, 3]) / ways
-    return np.rint(walls.min(axis=-1) * 1000).astype(np.uint16)
 
 
 @pytest.mark.parametrize("source", ["tf", "odometry", "pose"])

@@ -1,17 +1,26 @@
 """Robots that run, mapped as the bag of what they send would be: frames, poses, choices, and what is said."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import bag_clouds
+import inputs_bags
 import numpy as np
 import pytest
+from datasets_recordings import CAMERA
 from inputs_bags import (
     COUNT,
+    EYE,
+    EYES,
     FRAME,
+    INFO,
+    T_LINK_CAMERA,
     TOPIC,
     Bag,
     Kind,
@@ -20,6 +29,7 @@ from inputs_bags import (
     moving_tf,
     odometry,
     plain,
+    seen,
     stamp,
     stamped_poses,
     steps,
@@ -29,9 +39,12 @@ from inputs_bags import (
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.wires import robot as wired
+from taichi_mrf.datasets.wires import stream
 from taichi_mrf.datasets.wires.foxglove import wait_until
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
@@ -51,19 +64,24 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
     with ExitStack() as stack:
 
         def begin_one(
-            *parts: Part, query: str = "", first: int = 1000, kind: Kind = "mcap"
+            *parts: Part,
+            query: str = "",
+            first: int = 1000,
+            kind: Kind = "mcap",
+            color: bool = False,
+            listen_to: str = "/tf_static",
         ) -> tuple[Robot, Dataset, Path]:
             bag = write_bag(tmp_path, *parts, kind=kind)
             sender = stack.enter_context(robot(bag))
 
             def send() -> None:
-                sender.wait_for("/tf_static")
+                sender.wait_for(listen_to)
                 sender.send_next(first)
 
             thread = Thread(target=send)
             thread.start()
             try:
-                return sender, open_dataset(sender.source + query, color=False), bag
+                return sender, open_dataset(sender.source + query, color=color), bag
             finally:
                 thread.join()
 
@@ -126,9 +144,7 @@ def test_ros_1_is_read_too(begin: Begin) -> None:
 def came(live: Dataset) -> int:
     """Images that have come so far."""
     live.awaiting()
-    while hasattr(live, "source"):
-        live = live.source
-    return live._came
+    return whole(live)._came
 
 
 def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
@@ -138,15 +154,302 @@ def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> N
     assert f"{COUNT - 1} skipped, as mapping is slower" in live.awaiting()
 
 
-def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin) -> None:
+def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
     sender, live, _ = begin(images, mounted, partial(odometry, numbers=range(COUNT - 1)))
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
     assert live.read(0).name == f"{COUNT - 2:06d}"
     assert "left out" not in live.awaiting()
     static = next(data for topic, _, data in sender.messages if topic == "/tf_static")
-    later_ns = round(1e9 * (1_600_000_000 + stamp(COUNT) + wired.LATE_S + 1))
-    sender.channels["/tf_static"].log(static, log_time=later_ns)
-    assert wait_until(lambda: "1 left out: no poses within 0.1 s" in live.awaiting(), SECONDS)
+    monkeypatch.setattr(stream, "LATE_S", 0.1)
+
+    def is_left_out() -> bool:
+        sender.channels["/tf_static"].log(static)
+        return "1 left out: no poses within 0.1 s" in live.awaiting()
+
+    assert wait_until(is_left_out, SECONDS)
+
+
+LONG = range(20)
+"""Images of a walk that is longer than messages are ever out of order."""
+
+
+def long_walk(bag: Bag, T: np.ndarray = EYE) -> None:
+    images(bag, numbers=LONG)
+    mounted(bag)
+    odometry(bag, numbers=np.arange(-0.5, LONG.stop).tolist(), T=T)
+
+
+def test_where_time_jumps_back_poses_of_before_are_dropped(begin: Begin, tmp_path: Path) -> None:
+    sender, live, _ = begin(long_walk)
+    assert wait_until(lambda: came(live) == LONG.stop, SECONDS)
+    first = live.read(0)
+    assert live.arrivals().news == () or "jumped" not in " ".join(live.arrivals().news)
+    elsewhere = np.array([[1.0, 0, 0, 5], [0, 1, 0, -2], [0, 0, 1, 1], [0, 0, 0, 1]])
+    again = write_bag(tmp_path, partial(long_walk, T=elsewhere), kind="mcap")
+    with robot(again) as other:
+        sender.messages = other.messages
+    sender.send()
+    assert wait_until(lambda: came(live) == 2 * LONG.stop, SECONDS)
+    frame, recorded = live.read(1), open_dataset(again, color=False).read(LONG.stop - 1)
+    assert frame.name == f"{2 * LONG.stop - 1:06d}"
+    np.testing.assert_array_equal(frame.T_world_camera, recorded.T_world_camera)
+    np.testing.assert_array_equal(frame.depth_m, recorded.depth_m)
+    assert frame.stamp >= first.stamp  # the map's time never goes back
+    (said,) = [each for each in live.arrivals().news if "jumped back by 2.0 s" in each]
+    assert "poses of before are dropped, and mapping goes on" in said
+
+
+def test_stamps_of_another_clock_are_told_once_and_ages_count_from_arrival(begin: Begin) -> None:
+    def simulated(bag: Bag) -> None:
+        bag.send("/clock", "rosgraph_msgs/msg/Clock", 0.0, clock=bag.header(0.0, "").stamp)
+
+    _, live, _ = begin(plain, simulated)
+    assert live.arrivals().age_s is None
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    live.read(0)
+    found = live.arrivals()
+    assert len(found.news) == 1
+    assert f"stamps of {TOPIC} are " in found.news[0]
+    assert "days before this machine's clock: time is simulated or a bag's, by /clock" in found.news[0]
+    assert 0 <= found.age_s < 86400  # the stamps are of 2020
+
+
+def test_ages_are_those_of_stamps_where_clocks_agree(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = time.time()
+    monkeypatch.setattr(inputs_bags, "START", began - 2.0)
+    monkeypatch.setattr(stream, "CLOCKS_S", 600.0)
+    _, live, _ = begin(plain)
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    frame = live.read(0)
+    least = time.time() - frame.stamp
+    assert least - 0.01 <= live.arrivals().age_s <= time.time() - frame.stamp + 0.01
+    assert live.arrivals().news == ()
+
+
+def test_images_that_wait_for_poses_are_bounded(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "MOST_IMAGES", 2)
+    _, live, _ = begin(images, mounted, partial(odometry, numbers=[-2, -1]))
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    live = whole(live)
+    assert [image.number for image in live._waiting] == [COUNT - 2, COUNT - 1]
+    assert live.dropped == COUNT - 2
+
+
+def of_lidar(**more: np.ndarray) -> Part:
+    """Clouds, in which each point may have a ring and a time, of a lidar that drives and turns."""
+
+    def scans(bag: Bag) -> None:
+        for scan in range(bag_clouds.SCANS):
+            xyz = bag_clouds.points(scan)
+            if "ring" in more:
+                xyz = xyz.reshape(1, -1, 3)
+            bag_clouds.send(bag, bag_clouds.stamp(scan), xyz, **more)
+        bag_clouds.drive(bag)
+
+    return scans
+
+
+def in_the_world(bag: Bag, by_tf: bool) -> None:
+    """Clouds that an odometry has moved to the world's frame."""
+    for scan in range(bag_clouds.SCANS):
+        at = bag_clouds.stamp(scan)
+        T, xyz = bag_clouds.pose(at), bag_clouds.points(scan)
+        bag_clouds.send(bag, at, xyz @ T[:3, :3].T + T[:3, 3], frame="odom")
+    bag.tf("/tf_static", 0.0, "body", "lidar", EYE)
+    for i in range(8):
+        at = bag_clouds.stamp(0) - 0.05 + 0.05 * i
+        if by_tf:
+            bag.tf("/tf", at, "odom", "body", bag_clouds.pose(at))
+        else:
+            bag.odometry("/odom", at, "odom", "body", bag_clouds.pose(at))
+
+
+WIDTH = bag_clouds.CAMERA.shape[1]
+LIDARS: dict[str, Part] = {
+    "rows": of_lidar(),
+    "rows with times": of_lidar(t=np.tile(np.arange(WIDTH, dtype=np.uint32) * 3_400_000, (4, 1))),
+    "rings": of_lidar(ring=np.repeat(np.arange(4, dtype=np.uint16), WIDTH)[None]),
+    "free rays with times": of_lidar(
+        ring=np.zeros((1, 4 * WIDTH), np.uint16),
+        time=np.tile(np.linspace(-0.04, 0.04, WIDTH, dtype=np.float32), 4)[None],
+    ),
+    "moved to the world by odometry": partial(in_the_world, by_tf=False),
+    "moved to the world by tf": partial(in_the_world, by_tf=True),
+}
+
+
+@pytest.mark.parametrize("kind", LIDARS)
+def test_clouds_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> None:
+    sender, live, bag = begin(LIDARS[kind], first=5)
+    recorded = open_dataset(bag)
+    assert live.camera.shape == recorded.camera.shape
+    assert live.stated == replace(recorded.stated, swept_m=0.0)  # which is a note of reports
+    assert set(recorded.notes) <= set(live.notes)
+    found = one_by_one(sender, live)
+    assert len(found) == len(recorded) == bag_clouds.SCANS
+    for ours, theirs in zip(found, recorded, strict=True):
+        assert (ours.name, ours.stamp) == (theirs.name, theirs.stamp)
+        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+        np.testing.assert_array_equal(ours.no_return, theirs.no_return)
+        np.testing.assert_array_equal(ours.points_m, theirs.points_m)
+        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+COLOR, OWN_FRAME = "/camera/color/image_raw", "camera_color_optical_frame"
+OWN = PinholeCamera(32, 20, 30.0, 31.0, 15.0, 9.5)
+T_depth_color = look_at([0.02, 0.0, 0.0], [0.02, 0.01, 1.0])
+
+
+def picture(i: int, camera: PinholeCamera = CAMERA) -> np.ndarray:
+    return np.random.default_rng(100 + i).integers(1, 256, (*camera.shape, 3)).astype(np.uint8)
+
+
+def of_another_camera(bag: Bag) -> None:
+    bag.camera_info("/camera/color/camera_info", OWN_FRAME, OWN)
+    mounted(bag, FRAME, OWN_FRAME, T_depth_color)
+    images(bag, COLOR, False, OWN_FRAME, lambda i: picture(i, OWN), "rgb8", late=0.01)
+
+
+def compressed_colors(bag: Bag) -> None:
+    for i in range(COUNT):
+        bag.compressed(COLOR, stamp(i) - 0.01, FRAME, picture(i), "png")
+    bag.compressed(COLOR, stamp(COUNT), FRAME, picture(7), "png")
+
+
+COLORS: dict[str, Part] = {
+    "registered": partial(images, topic=COLOR, info=False, image=picture, encoding="rgb8", late=0.01),
+    "of another camera": of_another_camera,
+    "compressed, and earlier than depth": compressed_colors,
+}
+
+
+def one_by_one(sender: Robot, live: Dataset) -> list[Frame]:
+    """The frames of what the robot sends, when each message is heard before the next is sent."""
+    found, heard = [], heard_by(whole(live))
+    while sender.sent < len(sender.messages):
+        heard += sender.messages[sender.sent][0] in sender.listener.topics
+        sender.send_next(1)
+        assert wait_until(partial(has_heard, live, heard), SECONDS)
+        if not live.awaiting():
+            found.append(live.read(0))
+    return found
+
+
+@pytest.mark.parametrize("kind", COLORS)
+def test_colours_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> None:
+    parts = (images, mounted, partial(odometry, numbers=[*BETWEEN, COUNT]), COLORS[kind])
+    sender, live, bag = begin(*parts, first=5 + 2 * (kind == "of another camera"), color=True)
+    recorded = open_dataset(bag)
+    assert {note for note in live.notes if note.startswith("color")} == {
+        note for note in recorded.notes if note.startswith("color")
+    }
+    found = one_by_one(sender, live)
+    assert len(found) == len(recorded) == COUNT
+    for ours, theirs in zip(found, recorded, strict=True):
+        assert theirs.color is not None
+        np.testing.assert_array_equal(ours.color, theirs.color)
+        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+
+
+def test_depth_without_a_colour_image_near_it_has_no_colour(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = partial(images, topic=COLOR, info=False, image=picture, encoding="rgb8", numbers=[0])
+    sender, live, _ = begin(plain, one, color=True)
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    np.testing.assert_array_equal(live.read(0).color, picture(0))
+    assert live.awaiting()  # a colour image of the newest may yet come
+    monkeypatch.setattr(stream, "LATE_S", 0.1)
+
+    def is_there() -> bool:
+        sender.send("/tf_static")
+        return not live.awaiting()
+
+    assert wait_until(is_there, SECONDS)
+    frame = live.read(0)
+    assert (frame.name, frame.color) == (f"{COUNT - 1:06d}", None)
+
+
+def test_each_image_has_the_camera_of_its_time(begin: Begin) -> None:
+    other, small = PinholeCamera(16, 12, 21.0, 22.0, 7.5, 5.5), PinholeCamera(8, 6, 7.0, 7.5, 3.5, 2.5)
+    cameras = [CAMERA, CAMERA, other, small, small]
+
+    def zoomed(bag: Bag) -> None:
+        for i, camera in enumerate(cameras):
+            bag.camera_info(INFO, FRAME, camera, stamp=stamp(i))
+            bag.image(TOPIC, stamp(i), FRAME, steps(i)[: camera.height, : camera.width], "16UC1")
+
+    sender, live, bag = begin(zoomed, mounted, partial(odometry, numbers=BETWEEN), first=4)
+    assert whole(live).mapped.cameras.early == 0.0
+    found = one_by_one(sender, live)
+    assert [frame.camera for frame in found] == [frame.camera for frame in open_dataset(bag)] == cameras
+    (said,) = [each for each in live.arrivals().news if "camera changes" in each]
+    assert f"from frame 000002 on fx is {other.fx:g}, before {CAMERA.fx:g}; later changes are taken" in said
+
+
+def test_the_camera_of_a_distorted_lens_stays(begin: Begin) -> None:
+    other, lens = PinholeCamera(16, 12, 21.0, 22.0, 7.5, 5.5), (0.1, 0.0, 0.0, 0.0, 0.0)
+
+    def zoomed(bag: Bag) -> None:
+        for i, camera in enumerate([CAMERA] * 2 + [other] * 3):
+            bag.camera_info(INFO, FRAME, camera, distortion=lens, stamp=stamp(i))
+            bag.image(TOPIC, stamp(i), FRAME, steps(i), "16UC1")
+
+    sender, live, _ = begin(zoomed, mounted, partial(odometry, numbers=BETWEEN), first=4)
+    assert {frame.camera for frame in one_by_one(sender, live)} == {CAMERA}
+    (said,) = [each for each in live.arrivals().news if "camera changes" in each]
+    assert "the lens is distorted: that of before is kept" in said
+
+
+def test_float_depth_in_millimetres_is_refused(begin: Begin) -> None:
+    def millimetres(i: int) -> np.ndarray:
+        return steps(i).astype(np.float32)
+
+    with pytest.raises(DatasetError, match=r"too much for metres: pass --depth-scale 1000"):
+        begin(partial(images, image=millimetres, encoding="32FC1"), mounted, odometry)
+
+
+@pytest.mark.parametrize("is_body", [True, False])
+def test_poses_of_a_camera_link_are_turned_if_images_agree_so(begin: Begin, is_body: bool) -> None:
+    def poses(bag: Bag) -> None:
+        for i, T in enumerate(EYES):
+            bag.tf("/tf", stamp(i), "odom", "camera_link", T @ T_LINK_CAMERA.T if is_body else T)
+
+    _, live, _ = begin(partial(images, frame="camera_link", image=seen), poses, listen_to="/tf")
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    np.testing.assert_allclose(live.read(0).T_world_camera, EYES[-1], atol=1e-6)
+    assert any("of a body, x ahead and z up" in note for note in live.notes) == is_body
+
+
+def whole(live: Dataset) -> stream.Robot:
+    """The robot behind what mends its frames."""
+    while hasattr(live, "source"):
+        live = live.source
+    assert isinstance(live, stream.Robot)
+    return live
+
+
+def has_heard(live: Dataset, count: int) -> bool:
+    return heard_by(whole(live)) == count
+
+
+def heard_by(live: stream.Robot) -> int:
+    """Messages that have been heard so far."""
+    live.awaiting()
+    return sum(topic.messages for topic in live.heard.topics.values())
+
+
+def test_points_are_chosen_beside_images(begin: Begin) -> None:
+    def clouds(bag: Bag) -> None:
+        for scan in range(bag_clouds.SCANS):
+            bag_clouds.send(bag, stamp(scan), bag_clouds.points(scan))
+
+    parts = (plain, clouds, partial(mounted, child=bag_clouds.LIDAR, T=bag_clouds.T_BODY_LIDAR))
+    _, live, _ = begin(*parts, query="?points=/points")
+    assert "/points: images of 24 x 4 rays" in live.notes
+    assert live.camera.shape == bag_clouds.CAMERA.shape
+    _, live, _ = begin(*parts)
+    assert live.camera.shape == (12, 16)
 
 
 def test_a_robot_that_falls_silent_ends_what_waits_for_it(
@@ -155,7 +458,7 @@ def test_a_robot_that_falls_silent_ends_what_waits_for_it(
     sender, live, _ = begin(plain)
     live.read(0)
     sender.stop()
-    monkeypatch.setattr(wired, "SILENCE_S", 0.5)
+    monkeypatch.setattr(stream, "SILENCE_S", 0.5)
     with pytest.raises(DatasetError, match=r"foxglove:ws://127.0.0.1:\d+: nothing to map for 0.5 s"):
         live.read(1)
     assert wait_until(lambda: "trying again" in live.awaiting(), SECONDS)
@@ -193,7 +496,7 @@ def test_an_option_that_there_is_not_is_told() -> None:
 
 def test_poses_that_come_one_by_one_are_those_of_all() -> None:
     rng = np.random.default_rng(0)
-    stamps = rng.permutation(np.arange(0.0, 5.0, 0.1))
+    stamps = np.concatenate([rng.permutation(part) for part in np.split(np.arange(0.0, 5.0, 0.1), 10)])
     poses = [look_at(rng.normal(size=3), rng.normal(size=3)) for _ in stamps]
     grown = TimedPoses([], [])
     for s, T in zip(stamps, poses, strict=True):

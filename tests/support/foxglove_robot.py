@@ -1,5 +1,7 @@
 """A robot that runs: a server of Foxglove's own library that sends the messages of a bag."""
 
+import base64
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -7,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import foxglove
+from foxglove import messages as m
 from rosbags.highlevel import AnyReader
 
 from taichi_mrf.datasets.wires.foxglove import wait_until
@@ -30,10 +33,12 @@ class Listener:
 
 @dataclass
 class Robot:
-    """``messages`` are (topic, time of recording in nanoseconds, bytes) in order."""
+    """``messages`` are (topic, time of recording in nanoseconds, bytes) in order. In ``own``, protobuf or
+    json, they are Foxglove's own types in that encoding."""
 
     bag: Path
     port: int
+    own: str = ""
     listener: Listener = field(default_factory=Listener)
     sent: int = 0
 
@@ -43,6 +48,12 @@ class Robot:
         self.channels: dict[str, Any] = {}
         with AnyReader([self.bag]) as reader:
             for each in reader.connections:
+                if self.own:
+                    schema = own_schema(each.msgtype, self.own)
+                    self.channels[each.topic] = foxglove.Channel(
+                        each.topic, schema=schema, message_encoding=self.own, context=self.context
+                    )
+                    continue
                 name, text = each.msgtype, each.msgdef.data.encode()
                 if not reader.is2:
                     name = name.replace("/msg/", "/")
@@ -51,7 +62,10 @@ class Robot:
                 self.channels[each.topic] = foxglove.Channel(
                     each.topic, schema=schema, message_encoding=encoding, context=self.context
                 )
-            self.messages = [(each.topic, time, bytes(data)) for each, time, data in reader.messages()]
+            for each, time, data in reader.messages():
+                if self.own:
+                    data = own_message(reader.deserialize(data, each.msgtype), each.msgtype, self.own)
+                self.messages.append((each.topic, time, bytes(data)))
         self.start()
 
     @property
@@ -94,10 +108,109 @@ class Robot:
 
 
 @contextmanager
-def robot(bag: Path, port: int = 0) -> Iterator[Robot]:
+def robot(bag: Path, port: int = 0, own: str = "") -> Iterator[Robot]:
     """A robot that runs in the ``with`` block."""
-    found = Robot(bag, port)
+    found = Robot(bag, port, own)
     try:
         yield found
     finally:
         found.stop()
+
+
+OWN = {
+    "sensor_msgs/msg/Image": m.RawImage,
+    "sensor_msgs/msg/CompressedImage": m.CompressedImage,
+    "sensor_msgs/msg/CameraInfo": m.CameraCalibration,
+    "tf2_msgs/msg/TFMessage": m.FrameTransforms,
+    "sensor_msgs/msg/PointCloud2": m.PointCloud,
+    "geometry_msgs/msg/PoseStamped": m.PoseInFrame,
+}
+"""Foxglove's own types in the place of those of ROS."""
+
+PACKED = {1: "Int8", 2: "Uint8", 3: "Int16", 4: "Uint16", 5: "Int32", 6: "Uint32", 7: "Float32", 8: "Float64"}
+"""Names of the numbers of PointField."""
+
+
+def own_schema(msgtype: str, encoding: str) -> foxglove.Schema:
+    schema = OWN[msgtype].get_schema()
+    if encoding == "json":
+        return foxglove.Schema(name=schema.name, encoding="jsonschema", data=b'{"type": "object"}')
+    return schema
+
+
+def own_message(message: Any, msgtype: str, encoding: str) -> bytes:
+    """A message of ROS as Foxglove's library encodes its own, or by hand in JSON."""
+    if encoding == "protobuf":
+        return OWN[msgtype](**fields(message, msgtype, made)).encode()
+    return json.dumps(fields(message, msgtype, lambda name, /, **parts: parts)).encode()
+
+
+def made(name: str, /, **parts: Any) -> Any:
+    """A part of a message in Foxglove's library."""
+    if name == "Timestamp":
+        return m.Timestamp(parts["sec"], parts["nsec"])
+    if name == "PackedElementField":
+        kinds = m.PackedElementFieldNumericType
+        parts["type"] = getattr(kinds, next(PACKED[n] for n, own in NUMBERS.items() if own == parts["type"]))
+    return getattr(m, name)(**parts)
+
+
+NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
+"""PackedElementField's numbers of types, by those of PointField."""
+
+
+def fields(message: Any, msgtype: str, make: Callable[..., Any]) -> dict[str, Any]:
+    """The fields of Foxglove's message; ``make`` makes those that are messages themselves."""
+
+    def axes(value: Any, names: str) -> dict[str, float]:
+        return {name: float(getattr(value, name)) for name in names}
+
+    def head(header: Any, frame: str = "frame_id") -> dict[str, Any]:
+        time = make("Timestamp", sec=int(header.stamp.sec), nsec=int(header.stamp.nanosec))
+        return {"timestamp": time, frame: header.frame_id}
+
+    if msgtype == "tf2_msgs/msg/TFMessage":
+        return {
+            "transforms": [
+                make(
+                    "FrameTransform",
+                    **head(each.header, "parent_frame_id"),
+                    child_frame_id=each.child_frame_id,
+                    translation=make("Vector3", **axes(each.transform.translation, "xyz")),
+                    rotation=make("Quaternion", **axes(each.transform.rotation, "xyzw")),
+                )
+                for each in message.transforms
+            ]
+        }
+    found = head(message.header)
+    if msgtype == "geometry_msgs/msg/PoseStamped":
+        place = make("Vector3", **axes(message.pose.position, "xyz"))
+        turn = make("Quaternion", **axes(message.pose.orientation, "xyzw"))
+        return found | {"pose": make("Pose", position=place, orientation=turn)}
+    if msgtype == "sensor_msgs/msg/CameraInfo":
+        arrays = {name.upper(): [float(v) for v in getattr(message, name)] for name in "dkrp"}
+        sizes = {"width": message.width, "height": message.height}
+        return found | arrays | sizes | {"distortion_model": message.distortion_model}
+    data = bytes(message.data)
+    found["data"] = base64.b64encode(data).decode() if make is not made else data
+    if msgtype == "sensor_msgs/msg/CompressedImage":
+        return found | {"format": message.format}
+    if msgtype == "sensor_msgs/msg/PointCloud2":
+        packed = [
+            make(
+                "PackedElementField",
+                name=each.name,
+                offset=int(each.offset),
+                type=NUMBERS[int(each.datatype)],
+            )
+            for each in message.fields
+        ]
+        rows = [
+            bytes(message.data[i * message.row_step :][: message.width * message.point_step])
+            for i in range(message.height)
+        ]
+        data = b"".join(rows)  # Foxglove's points have no rows
+        found["data"] = base64.b64encode(data).decode() if make is not made else data
+        return found | {"point_stride": message.point_step, "fields": packed}
+    sizes = {name: getattr(message, name) for name in ("width", "height", "step", "encoding")}
+    return found | sizes

@@ -284,6 +284,17 @@ def steps(i: int) -> np.ndarray:
     return image
 
 
+T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
+
+
+def seen(i: int) -> np.ndarray:
+    """Millimetres of the walls of a box, 5 x 4 x 3 m, from inside."""
+    ways = CAMERA.rays() @ EYES[i][:3, :3].T
+    walls = (np.sign(ways) * [2.5, 2.0, 1.5] - EYES[i][:3, 3]) / ways
+    return np.rint(walls.min(axis=-1) * 1000).astype(np.uint16)
+
+
 def world_body(i: float) -> Pose:
     return look_at([0.1 * i, 0.2, 0.0], [3.0, 0.1 * i, 0.2])
 

@@ -11,7 +11,7 @@ choose them.
 """
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,31 +25,27 @@ from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.images import note_of_largest
-from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
-from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.poses import pose_candidates
+from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds
+from taichi_mrf.datasets.ros.poses import BagPoses, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import (
     BagCameras,
-    DepthChoice,
+    SensorChoice,
     find_depth_camera,
-    find_sensor,
     posed_by,
-    poses_of,
     track_of,
 )
 from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
-    choose,
     cloud_topics,
     depth_topics,
     message_frame,
 )
-from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap
+from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -69,11 +65,8 @@ _LOOKED_AT = 4
 
 
 @dataclass(frozen=True)
-class BagOptions(DepthChoice):
+class BagOptions(SensorChoice):
     """The options after the name of a bag."""
-
-    color: str = ""
-    """The topic of colour images, by default the only one."""
 
     confidence: str = ""
     """The topic of images of confidence, by default the one beside that of depth."""
@@ -81,13 +74,6 @@ class BagOptions(DepthChoice):
     imu: str = ""
     """The topic of an IMU whose angular rates help to track the camera (``poses=track``), by default the only
     one; ``none`` for tracking without."""
-
-    points: str = ""
-    """The topic of a lidar's point clouds, in place of depth images; of a bag without depth images by default
-    the only one."""
-
-    deskew: bool = True
-    """Undo the lidar's motion during a scan, where points have times."""
 
 
 @dataclass
@@ -123,20 +109,13 @@ class RosBag(Table[BagRow]):
         """Take the poses for those of a body's axes, x ahead and z up, if neighbouring images agree clearly
         better so: names such as camera_link are used for both."""
         recorded = [self.pose(index) for index in range(len(self.rows))]
-        turned = [pose_of(T, Conventions(axes="ros")) for T in recorded]
-        found = [
-            gather(len(poses), poses.__getitem__, self._metres, self.camera, (1.0,)).disagreement
-            for poses in (recorded, turned)
-        ]
-        if all(found) and found[1][1.0] < min(_AGREE, 0.5 * found[0][1.0]):
+        said = by_body_axes(recorded, self._metres, self.camera, frame)
+        if said:
+            turned = [turned_axes(T) for T in recorded]
             self.rows = [replace(row, pose=T) for row, T in zip(self.rows, turned, strict=True)]
             if self.track is not None:
                 self.track = partial(_turned, self.track)
-            self.notes.append(
-                f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
-                f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
-                "?body=FRAME or ?optical=FRAME takes them as they are"
-            )
+            self.notes.append(said)
 
     def _metres(self, index: int) -> NDArray[np.float32]:
         message = self.reader.read(self.topic, self.rows[index].entry)
@@ -156,10 +135,40 @@ class RosBag(Table[BagRow]):
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
+def turned_axes(T: Pose) -> Pose:
+    """A pose of a body's axes, x ahead and z up, as that of the camera's."""
+    return pose_of(T, Conventions(axes="ros"))
+
+
+def may_be_body_axes(found: Mapping[str, BagPoses], chosen: SensorChoice, options: ReadOptions) -> bool:
+    """True if nothing says whether poses, by the frames of images, are of a camera's axes or a body's."""
+    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
+    stated = chosen.poses == TRACK or chosen.optical or chosen.body or options.conventions.of_poses
+    return doubtful and not stated
+
+
+def by_body_axes(
+    recorded: Sequence[Pose], metres: Callable[[int], NDArray[np.float32]], camera: PinholeCamera, frame: str
+) -> str:
+    """A note if the poses of images are clearly those of a body's axes: neighbouring images then agree much
+    better. ``metres`` reads an image. Empty if not."""
+    found = [
+        gather(len(poses), poses.__getitem__, metres, camera, (1.0,)).disagreement
+        for poses in (recorded, [turned_axes(T) for T in recorded])
+    ]
+    if not all(found) or found[1][1.0] >= min(_AGREE, 0.5 * found[0][1.0]):
+        return ""
+    return (
+        f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
+        f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
+        "?body=FRAME or ?optical=FRAME takes them as they are"
+    )
+
+
 def _turned(track: Callable[[], StampedPoses]) -> StampedPoses:
     """The poses of a body's axes as those of the camera's."""
     stamps, poses = track()
-    return stamps, [pose_of(T, Conventions(axes="ros")) for T in poses]
+    return stamps, [turned_axes(T) for T in poses]
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -192,7 +201,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
 
 
 def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Dataset:
-    if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
+    if maps_clouds(reader, chosen):
         return _open_lidar(reader, chosen, options)
     depth, sensor, cameras, found = find_depth_camera(reader, chosen, options)
     posed, notes = posed_by(sensor, found, options)
@@ -228,37 +237,24 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         gyro=imu.gyro,
         acceleration=imu.acceleration,
     )
-    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
-    if doubtful and not (tracked or chosen.optical or chosen.body or options.conventions.of_poses):
+    if may_be_body_axes(found, chosen, options):
         bag.look_at_axes(depth.frame)
     return bag
 
 
 def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
-    refuse_image_options(f"{reader.path}", options)
-    topic = choose(reader, "points", chosen.points, cloud_topics(reader), "topics of point clouds")
-    if reader.topics[topic].type != messages.POINT_CLOUD:
-        raise DatasetError(
-            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {messages.POINT_CLOUD}"
-        )
-    sensor = find_sensor(reader, topic, "clouds", chosen)
-    found = poses_of(sensor, chosen)
-    tracked, registered = chosen.poses == TRACK, any(each.registered for each in found.values())
-    if tracked:
-        found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
+    sensor, found, clouds = find_clouds(reader, chosen, options)
+    tracked = chosen.poses == TRACK
     posed, notes = posed_by(sensor, found, options)
-    gap, deskews = largest_gap(options), chosen.deskew and not tracked and not registered
     bag = LidarBag(
         name=reader.path.stem,
         camera=RayTable([[1.0, 0.0, 0.0]]),
         notes=notes,
         dropped=len(sensor.entries) - len(posed),
         reader=reader,
-        topic=topic,
+        clouds=clouds,
         rows=_rows(reader, posed),
-        track=None if tracked or registered else track_of(found, options),
-        at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
-        registered=registered,
+        track=None if tracked or clouds.registered else track_of(found, options),
         tracked=tracked,
     )
     bag.look_at_first()

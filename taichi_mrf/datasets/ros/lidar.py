@@ -1,4 +1,4 @@
-"""A bag's point clouds as lidar scans: ``walk.mcap?points=/points&pose=/odom``.
+"""Point clouds of ROS as lidar scans: ``walk.mcap?points=/points&pose=/odom``.
 
 The fields of a sensor_msgs/PointCloud2 are found by their names, whatever the driver. A cloud that is an
 image of rows (beams) and columns, or whose rings can be put together to one, becomes an image, whose pixels
@@ -11,16 +11,31 @@ meanwhile, each ray starts where the lidar was at that time.
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Table
-from taichi_mrf.datasets.lidar.scans import LidarRecording, Motion, Scan, measured_points
+from taichi_mrf.datasets.lidar.scans import (
+    LidarRecording,
+    Motion,
+    Scan,
+    measured_points,
+    refuse_image_options,
+)
+from taichi_mrf.datasets.options import TRACK, ReadOptions
+from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
+from taichi_mrf.datasets.ros.sensor import BagSensor, SensorChoice, find_sensor, poses_of
+from taichi_mrf.datasets.ros.sources import Entry, TopicSource
+from taichi_mrf.datasets.ros.topics import choose, cloud_topics, depth_topics
+from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
@@ -53,12 +68,14 @@ def decode(message: Any, stamp: float) -> Cloud:
     with np.errstate(invalid="ignore", over="ignore"):
         points_m = np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     ring = next((points[name] for name in RINGS if name in names and points[name].dtype.kind in "iu"), None)
+    return Cloud(points_m, None if ring is None else ring.astype(np.int64), _times(points, stamp))
+
+
+def _times(points: NDArray, stamp: float) -> NDArray[np.float64] | None:
+    """When points (H, W) were measured, in seconds from the header's stamp, if the message has that."""
+    names = points.dtype.names or ()
     time = next((points[name] for name in TIMES if name in names), None)
-    return Cloud(
-        points_m,
-        None if ring is None else ring.astype(np.int64),
-        None if time is None else _seconds(time, stamp),
-    )
+    return None if time is None else _seconds(time, stamp)
 
 
 def _records(message: Any) -> NDArray:
@@ -224,51 +241,103 @@ def _filled(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 @dataclass
 class LidarBag(LidarRecording, Table[BagRow]):
-    """The point clouds of one topic, each with its pose. ``at`` gives the pose of the lidar of a frame at a
-    time in seconds, or None; if it is None itself, points are left where they are. ``registered`` points are
-    in the world's frame, and are taken back into the lidar's."""
+    """The point clouds of one topic, each with its pose."""
 
     reader: RosReader = field(kw_only=True)
-    topic: str = field(kw_only=True)
-    at: Callable[[str, float], Pose | None] | None = None
-    registered: bool = False
+    clouds: "Clouds" = field(kw_only=True)
 
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one cloud, which must have a measurement."""
-        message, entry = self.reader.read(self.topic, row.entry), row.entry
-        with naming(f"{self.reader.path}: topic {self.topic}"):
-            cloud = decode(message, entry.stamp)
-            measured = measured_points(cloud.points_m)
-            if not measured.any():
-                raise DatasetError(f"none of {measured.size} points is a measurement")
-        pose = T_world_camera
-        if self.registered:
-            own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
-            cloud = replace(cloud, points_m=own.astype(cloud.points_m.dtype))
-        motion = None if self.at is None else Motion(entry.stamp, pose, partial(self.at, entry.frame))
-        scan = _image(cloud, motion) or _free(cloud, motion)
-        return Frame(scan.range_m, pose, scan.camera, entry.stamp, row.name, no_return=scan.no_return)
+        message = self.reader.read(self.clouds.topic, row.entry)
+        return self.clouds.frame(row.entry, message, T_world_camera, row.stamp, row.name)
 
     def look_at_first(self, what: str = "cloud") -> None:
         """Set camera, reach and a note from the first cloud that can be read. Raises DatasetError as for any
         lidar."""
         super().look_at_first(what)
-        pattern = isinstance(self.camera, RayTable) and self.camera.has_pattern
-        rays = f"images of {self.camera.width} x {self.camera.height} rays" if pattern else "free rays"
-        self.notes.append(f"{self.topic}: {rays}")
-        if self.registered:
+        self.notes.append(self.clouds.in_words(self.camera))
+        if self.clouds.registered:
             self.swept_m = 0.0
         elif self.swept_m and self._has_times():
             self.notes.append(
-                f"{self.topic}: the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at 10 m, "
-                "which is not undone, though its points have times: leave out deskew=false"
+                f"{self.clouds.topic}: the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at "
+                "10 m, which is not undone, though its points have times: leave out deskew=false"
             )
 
     def _has_times(self) -> bool:
         """True if points of the first cloud have times that differ."""
         entry = self.rows[0].entry
-        seconds = decode(self.reader.read(self.topic, entry), entry.stamp).seconds
+        seconds = decode(self.reader.read(self.clouds.topic, entry), entry.stamp).seconds
         return seconds is not None and bool(np.ptp(seconds[np.isfinite(seconds)]) > 0)
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """How the point clouds of a ``topic`` of the source at ``path`` become frames. ``at`` gives the pose of
+    the lidar of a frame at a time in seconds, or None; if it is None itself, points are left where they are.
+    ``registered`` points are in the world's frame, and are taken back into the lidar's."""
+
+    path: Path | str
+    topic: str
+    at: Callable[[str, float], Pose | None] | None
+    registered: bool
+
+    def frame(self, entry: Entry, message: Any, pose: Pose, stamp: float, name: str) -> Frame:
+        """The frame of a cloud, with a stamp and a name. Raises DatasetError, which names source and topic,
+        if it cannot be decoded or nothing was measured."""
+        with naming(f"{self.path}: topic {self.topic}"):
+            cloud = decode(message, entry.stamp)
+            measured = measured_points(cloud.points_m)
+            if not measured.any():
+                raise DatasetError(f"none of {measured.size} points is a measurement")
+        if self.registered:
+            own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
+            cloud = replace(cloud, points_m=own.astype(cloud.points_m.dtype))
+        motion = None if self.at is None else Motion(entry.stamp, pose, partial(self.at, entry.frame))
+        scan = _image(cloud, motion) or _free(cloud, motion)
+        return Frame(scan.range_m, pose, scan.camera, stamp, name, no_return=scan.no_return)
+
+    def until(self, entry: Entry, message: Any) -> float:
+        """The time in seconds up to which the lidar's poses are asked for by a cloud."""
+        if self.at is None:
+            return entry.stamp
+        try:
+            seconds = _times(_records(message), entry.stamp)
+        except DatasetError:  # reported when its frame is read
+            return entry.stamp
+        return entry.stamp + (0.0 if seconds is None else max(0.0, float(np.nanmax(seconds))))
+
+    def in_words(self, camera: Camera) -> str:
+        """A note of the rays of a camera."""
+        pattern = isinstance(camera, RayTable) and camera.has_pattern
+        rays = f"images of {camera.width} x {camera.height} rays" if pattern else "free rays"
+        return f"{self.topic}: {rays}"
+
+
+def maps_clouds(reader: TopicSource, choice: SensorChoice) -> bool:
+    """True if point clouds are mapped, and no images of depth."""
+    return bool(choice.points or (not choice.depth and cloud_topics(reader) and not depth_topics(reader)))
+
+
+def find_clouds(
+    reader: TopicSource, choice: SensorChoice, options: ReadOptions
+) -> tuple[BagSensor, dict[str, BagPoses], Clouds]:
+    """The point clouds that are mapped, as the user chose, else the only ones, their poses by frames, and how
+    they become frames. Raises DatasetError, whose text names the source and lists the candidates."""
+    refuse_image_options(f"{reader.path}", options)
+    topic = choose(reader, "points", choice.points, cloud_topics(reader), "topics of point clouds")
+    if reader.topics[topic].type != messages.POINT_CLOUD:
+        raise DatasetError(
+            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {messages.POINT_CLOUD}"
+        )
+    sensor = find_sensor(reader, topic, "clouds", choice)
+    found = poses_of(sensor, choice)
+    tracked, registered = choice.poses == TRACK, any(each.registered for each in found.values())
+    if tracked:
+        found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
+    gap, deskews = largest_gap(options), choice.deskew and not tracked and not registered
+    at = (lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None
+    return sensor, found, Clouds(reader.path, topic, at, registered)
 
 
 def _image(cloud: Cloud, motion: Motion | None) -> Scan | None:

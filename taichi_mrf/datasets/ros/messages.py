@@ -28,6 +28,7 @@ IMAGE = "sensor_msgs/msg/Image"
 IMAGES = (IMAGE, "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+OF_SENSORS = (*IMAGES, POINT_CLOUD)
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"

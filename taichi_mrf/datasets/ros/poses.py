@@ -92,7 +92,7 @@ class BagPoses:
         """The time in seconds up to which poses are known: later ones have yet to come. A transform that came
         once, beside others that come again, does not move."""
         again = [each for each in self.moving if len(each) > 1] or self.moving
-        return min((float(each.stamps[-1]) for each in again), default=math.inf)
+        return min((float(each.stamps.max(initial=-math.inf)) for each in again), default=math.inf)
 
 
 def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:
@@ -171,18 +171,24 @@ def _from_tree(reader: TopicSource, tree: TransformTree, optical: str, choice: P
     last = min((each.stamps[-1] for each in moving), default=math.inf)
     span = f"{first:.3f} to {last:.3f} s"
 
-    def hear(topic: Topic, entry: Entry, message: Any) -> None:
-        if topic.type in messages.TF:
-            tree.hear(topic.name, entry, message, moving, KEPT_S)
-
     return BagPoses(
         lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
         f"tf from {fixed} to {optical}: {span}",
         [note],
         stamps=max((each.stamps for each in moving), key=len, default=()),
-        hear=hear,
+        hear=_hearing(tree, moving),
         moving=moving,
     )
+
+
+def _hearing(tree: TransformTree, moving: Sequence[TimedPoses]) -> Callable[[Topic, Entry, Any], None]:
+    """Takes the transforms of a robot that runs."""
+
+    def hear(topic: Topic, entry: Entry, message: Any) -> None:
+        if topic.type in messages.TF:
+            tree.hear(topic.name, entry, message, moving, KEPT_S)
+
+    return hear
 
 
 def _of_body(
@@ -200,8 +206,14 @@ def _of_body(
         raise DatasetError(f"{reader.path}: the messages are of {fixed}, so the map is: leave out ?frame=")
     note = f"poses in {fixed} from tf, of {body}, from where the data were moved to {fixed}"
     note += "; ?body=FRAME sets another"
+    moving = [edge for edge in tree.between(fixed, body) if isinstance(edge, TimedPoses)]
     return BagPoses(
-        lambda stamp, gap: tree.lookup(fixed, body, stamp, gap), f"tf from {fixed} to {body}", [note], True
+        lambda stamp, gap: tree.lookup(fixed, body, stamp, gap),
+        f"tf from {fixed} to {body}",
+        [note],
+        True,
+        hear=_hearing(tree, moving),
+        moving=moving,
     )
 
 
@@ -236,17 +248,18 @@ def _from_topic(
         steps = [*tree.between(fixed, parent), *tree.between(body, optical)]
         moving += [step for step in steps if isinstance(step, TimedPoses)]
 
+    hear_tf = _hearing(tree, moving)
+
     def hear(topic: Topic, entry: Entry, message: Any) -> None:
-        if topic.type in messages.TF:
-            tree.hear(topic.name, entry, message, moving, KEPT_S)
-        elif topic.name == name and _is_of(entry, message, parent, child):
+        hear_tf(topic, entry, message)
+        if topic.name == name and _is_of(entry, message, parent, child):
             pose = _valid_pose(message)
             if pose is not None:
                 timed.add(entry.stamp, pose, KEPT_S)
 
     source = f"{name}: {_span(timed)}"
     if registered:
-        return BagPoses(at, source, notes, registered=True)
+        return BagPoses(at, source, notes, registered=True, hear=hear, moving=moving)
     return BagPoses(
         at,
         source,

@@ -28,14 +28,24 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
-class DepthChoice(PoseChoice):
-    """How the images of depth and their poses are chosen."""
+class SensorChoice(PoseChoice):
+    """How the messages of a sensor and their poses are chosen."""
 
     depth: str = ""
     """The topic of depth images."""
 
     info: str = ""
     """The topic of their CameraInfo."""
+
+    points: str = ""
+    """The topic of a lidar's point clouds, in place of depth images; without depth images by default the only
+    one."""
+
+    color: str = ""
+    """The topic of colour images, by default the only one."""
+
+    deskew: bool = True
+    """Undo the lidar's motion during a scan, where points have times."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +172,7 @@ class DepthCamera(NamedTuple):
     poses: dict[str, BagPoses]
 
 
-def find_depth_camera(reader: TopicSource, choice: DepthChoice, options: ReadOptions) -> DepthCamera:
+def find_depth_camera(reader: TopicSource, choice: SensorChoice, options: ReadOptions) -> DepthCamera:
     """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
     text names the source and lists the candidates."""
     depth = choose_depth(reader, choice.depth)
@@ -206,12 +216,44 @@ class StatedCamera:
 @dataclass(frozen=True)
 class BagCameras:
     """The cameras by the frame of their images (empty for all), each with the time in seconds from which
-    on it took them; the ``first``; the ``distortion`` of all; ``notes`` for the user."""
+    on it took them; the ``first``; the ``distortion`` of all; ``notes`` for the user. They are of the
+    CameraInfo of a ``topic``, none if the user gave them, whose frames are ``sent_by`` those of images;
+    ``depth`` are the images, and a camera takes them from half a frame, ``early`` seconds, before it is sent.
+    """
 
-    by_frame: Mapping[str, Sequence[tuple[float, StatedCamera]]]
+    by_frame: Mapping[str, list[tuple[float, StatedCamera]]]
     first: PinholeCamera
     distortion: tuple[float, ...] = ()
     notes: list[str] = field(default_factory=list)
+    topic: str = ""
+    sent_by: Mapping[str, str] = field(default_factory=dict)
+    rectified: bool = False
+    early: float = 0.0
+    stored: Callable[[StatedCamera], StatedCamera] = lambda camera: camera
+    """A camera that is stated as that of stored images, which may be turned."""
+
+    def hear(self, entry: Entry, message: Any) -> tuple[float, str]:
+        """Take a CameraInfo of a robot that runs, and return from when on it counts, with what to say if it
+        changes a camera, else an empty text. A lens that is distorted stays what it was at first."""
+        try:
+            camera, distortion = camera_of(message, self.rectified)
+            camera = self.stored(camera)
+        except DatasetError:  # of a driver that starts again
+            return entry.stamp, ""
+        since, said = entry.stamp - self.early, ""
+        for stated in (self.by_frame[frame] for frame, of in self.sent_by.items() if of == entry.frame):
+            old = stated[-1][1]
+            if distortion != self.distortion or (distortion and camera != old):
+                said = "and the lens is distorted: that of before is kept"
+            elif camera != old:
+                stated.append((since, camera))
+                said = f"fx is {camera.full.fx:g}, before {old.full.fx:g}"
+        return since, said
+
+    def begin_again(self) -> None:
+        """Take the last cameras from any time on: the clock has started again."""
+        for stated in self.by_frame.values():
+            stated[:] = [(-np.inf, stated[-1][1])]
 
     def at(self, entry: Entry, shape: tuple[int, int] | None = None) -> PinholeCamera:
         """The camera that took an image, of the size that was stated if none has the image's."""
@@ -227,7 +269,7 @@ class BagCameras:
             return StatedCamera(*(of_image_size(each, size, turned) for each in (camera.full, camera.cut)))
 
         stated = {frame: [(s, of(each)) for s, each in found] for frame, found in self.by_frame.items()}
-        return replace(self, by_frame=stated, first=of_image_size(self.first, size, turned))
+        return replace(self, by_frame=stated, first=of_image_size(self.first, size, turned), stored=of)
 
     def measured(
         self, message: Any, entry: Entry, depth_scale: float | None, where: str
@@ -274,9 +316,10 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
         if not found or found[-1][1:] != (camera, distortion):
             found.append((entry.stamp - early, camera, distortion))
     frames = dict.fromkeys(entry.frame for entry in entries)
-    by_frame, lenses = {}, []
+    by_frame, lenses, sent_by = {}, [], {}
     for frame in frames:
         of = _frame_of_info(reader, depth, name, frame, [*stated, *problems], bool(wanted), len(frames) > 1)
+        sent_by[frame] = of
         if of not in stated:
             raise DatasetError(f"{reader.path}: topic {name}: {problems[of]}")
         found = stated[of]
@@ -293,7 +336,14 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
             "?optical=FRAME takes one's images only"
         )
     cameras = BagCameras(
-        by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame, entries)
+        by_frame,
+        by_frame[entries[0].frame][0][1].cut,
+        lenses[0],
+        _changes(by_frame, entries),
+        name,
+        sent_by,
+        depth.rectified,
+        early,
     )
     return _fitted(reader, depth, name, entries, cameras, options.conventions.turned)
 

@@ -21,13 +21,15 @@ Place = tuple[int, int]
 @dataclass(frozen=True)
 class Channel:
     """A topic as its sender describes it: the ``type`` of its messages as ROS 2 writes it, their ``encoding``
-    (cdr or ros1), and their ``definition`` in a ``language`` (MSG, IDL, or NONE without one)."""
+    (cdr or ros1), and their ``definition`` in a ``language`` (MSG, IDL, or NONE without one). ``schema`` is
+    Foxglove's own type that is read as this one, else empty."""
 
     topic: str
     type: str
     encoding: str
     language: str = "NONE"
     definition: str = ""
+    schema: str = ""
 
 
 @dataclass(frozen=True)

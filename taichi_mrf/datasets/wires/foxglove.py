@@ -14,7 +14,7 @@ import socket
 import struct
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,6 +28,7 @@ from websockets.typing import Subprotocol
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import CDR, LANGUAGES, ROS1, ros2_name
 from taichi_mrf.datasets.ros.sources import Channel
+from taichi_mrf.datasets.wires.schemas import JSON, PROTOBUF, ROS_TYPES
 from taichi_mrf.errors import DatasetError, said
 
 SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
@@ -36,6 +37,12 @@ BRIDGE = "ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
 
 MOST_IMAGES = 64
 """Images that wait to be taken; two seconds of a camera, so that slow poses find theirs."""
+
+RATE_S = 5.0
+"""Seconds over which the rate of images is averaged."""
+
+MOST_TIMES = 1000
+"""Times of images that are counted: RATE_S at 200 Hz."""
 
 MOST_OTHERS = 100_000
 """Other messages that wait to be taken: a quarter of an hour of tf at 100 Hz."""
@@ -52,29 +59,34 @@ _MESSAGE_DATA = 1
 
 @dataclass(frozen=True)
 class Raw:
-    """A message as it came: its channel, when the server logged it, and its bytes."""
+    """A message as it came: its channel, when the server logged it, when it ``arrived_s`` on this machine's
+    monotonic clock, and its bytes."""
 
     channel: Channel
     logged_ns: int
+    arrived_s: float
     data: bytes
 
 
 class FoxgloveClient:
     """A connection to a server. ``channels`` are those that it has now by their topics, ``dropped`` counts
-    the images that nobody took in time; ``problem`` says why nothing comes while the connection is lost."""
+    the images of a topic that nobody took in time; ``problem`` says why nothing comes while the connection is
+    lost."""
 
     def __init__(self, address: str) -> None:
         """Connect to ``ws://host:port``; the scheme and the port may be missing. Raises DatasetError, which
         names the address, if nobody listens there or another program does."""
         self.address = _whole(address)
         self.channels: dict[str, Channel] = {}
-        self.dropped, self.problem = 0, ""
+        self.dropped: Counter[str] = Counter()
+        self.problem = ""
         self._wanted: set[str] = set()
         self._subscribed: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
         self._by_number: dict[int, str] = {}
         self._images: deque[tuple[int, Raw]] = deque()
         self._others: deque[tuple[int, Raw]] = deque(maxlen=MOST_OTHERS)
+        self._times: dict[str, deque[float]] = {}
         self._came, self._lock = 0, threading.Lock()
         self._advertised, self._ended = threading.Event(), threading.Event()
         self._connection = self._connect()
@@ -106,6 +118,15 @@ class FoxgloveClient:
             self._images.clear()
             self._others.clear()
         return [raw for _, raw in found]
+
+    def rate_hz(self, topic: str) -> float:
+        """Images of a topic a second, over the last RATE_S seconds."""
+        since = time.monotonic() - RATE_S
+        with self._lock:
+            times = self._times.get(topic, deque())
+            while times and times[0] < since:
+                times.popleft()
+            return len(times) / RATE_S
 
     def close(self) -> None:
         """End the connection."""
@@ -184,14 +205,15 @@ class FoxgloveClient:
             if channel is None:
                 return
             self._came += 1
-            raw = self._came, Raw(channel, logged_ns, frame[_MESSAGE.size :])
-            if channel.type not in messages.IMAGES:
+            raw = self._came, Raw(channel, logged_ns, time.monotonic(), frame[_MESSAGE.size :])
+            if channel.type not in messages.OF_SENSORS:
                 self._others.append(raw)
                 return
             self._images.append(raw)
+            self._times.setdefault(channel.topic, deque(maxlen=MOST_TIMES)).append(raw[1].arrived_s)
             if len(self._images) > MOST_IMAGES:
-                self._images.popleft()
-                self.dropped += 1
+                _, oldest = self._images.popleft()
+                self.dropped[oldest.channel.topic] += 1
 
     def _take_in_words(self, words: dict[str, Any]) -> None:
         if words.get("op") == "advertise":
@@ -245,9 +267,12 @@ def wait_until(done: Callable[[], bool], seconds: float, step_s: float = 0.01) -
 
 
 def _channel(words: dict[str, Any]) -> Channel:
-    """A channel as it is advertised. The definition of a language in binary, such as protobuf's, is not
-    read."""
+    """A channel as it is advertised. Of those in protobuf or JSON Foxglove's own types are read."""
     encoding, kind = str(words["encoding"]), str(words.get("schemaName", ""))
+    if encoding in (PROTOBUF, JSON) and kind in ROS_TYPES:
+        return Channel(
+            str(words["topic"]), ROS_TYPES[kind], encoding, "NONE", str(words.get("schema", "")), kind
+        )
     language = str(words.get("schemaEncoding", "")) or {CDR: "ros2msg", ROS1: "ros1msg"}.get(encoding, "")
     return Channel(
         str(words["topic"]),

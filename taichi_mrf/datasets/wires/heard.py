@@ -4,20 +4,28 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import Decoder
 from taichi_mrf.datasets.ros.sources import Channel, Entry, Topic, TopicSource, entry_of
 from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient
+from taichi_mrf.datasets.wires.schemas import SchemaDecoder
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.libraries import library
 
-Heard = tuple[Topic, Entry, Any]
-"""A message that has just come, decoded."""
 
-DEPTH_NEEDS = (*messages.IMAGES, messages.CAMERA_INFO, *messages.TF, *messages.POSES)
-"""The types of messages from which images of depth are mapped."""
+class Heard(NamedTuple):
+    """A message that has come, decoded, and when, on this machine's monotonic clock."""
+
+    topic: Topic
+    entry: Entry
+    message: Any
+    arrived_s: float
+
+
+NEEDED = (*messages.OF_SENSORS, messages.CAMERA_INFO, *messages.TF, *messages.POSES)
+"""The types of messages from which images of depth and point clouds are mapped."""
 
 
 class HeardTopics(TopicSource):
@@ -33,7 +41,8 @@ class HeardTopics(TopicSource):
         self.broken: Counter[str] = Counter()
         self.problem = ""
         self._decoder = Decoder()
-        self._kept: dict[str, deque[tuple[Entry, Any]]] | None = {}
+        self._own: dict[Channel, SchemaDecoder] = {}
+        self._kept: dict[str, deque[Heard]] | None = {}
         self._learnt: set[Channel] = set()
         self._last: dict[str, Entry] = {}
         self._began = time.monotonic()
@@ -56,7 +65,10 @@ class HeardTopics(TopicSource):
         for raw in self.client.take():
             channel = raw.channel
             try:
-                message = self._decoder.decode(channel.type, channel.encoding, raw.data)
+                if channel in self._own:
+                    message = self._own[channel].decode(raw.data)
+                else:
+                    message = self._decoder.decode(channel.type, channel.encoding, raw.data)
             except Exception as error:  # the library raises many kinds of errors
                 self.broken[channel.topic] += 1
                 self.problem = f"{self.path}: topic {channel.topic}: cannot be read: {said(error)}"
@@ -67,10 +79,10 @@ class HeardTopics(TopicSource):
             topic = self.topics[channel.topic]
             self._last[channel.topic] = entry
             self.topics[channel.topic] = topic = replace(topic, messages=topic.messages + 1)
+            found.append(Heard(topic, entry, message, raw.arrived_s))
             if self._kept is not None:
-                most = MOST_IMAGES if topic.type in messages.IMAGES else None
-                self._kept.setdefault(topic.name, deque(maxlen=most)).append((entry, message))
-            found.append((topic, entry, message))
+                most = MOST_IMAGES if topic.type in messages.OF_SENSORS else None
+                self._kept.setdefault(topic.name, deque(maxlen=most)).append(found[-1])
         return found
 
     def forget(self) -> None:
@@ -79,7 +91,11 @@ class HeardTopics(TopicSource):
 
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
         """Those that are kept."""
-        return iter([] if self._kept is None else list(self._kept.get(topic, ())))
+        return ((each.entry, each.message) for each in self.kept(topic))
+
+    def kept(self, topic: str) -> list[Heard]:
+        """The messages of a topic that are kept."""
+        return [] if self._kept is None else list(self._kept.get(topic, ()))
 
     def read(self, topic: str, entry: Entry) -> Any:
         """One that is kept."""
@@ -94,7 +110,13 @@ class HeardTopics(TopicSource):
         if not new:
             return
         self._learnt |= set(new)
-        for channel, problem in zip(new, self._decoder.learn(new), strict=True):
+        problems = dict(zip(new, self._decoder.learn(new), strict=True))
+        for channel in (each for each in new if each.schema):
+            try:
+                self._own[channel], problems[channel] = SchemaDecoder(channel), ""
+            except Exception as error:  # descriptors may be anything
+                problems[channel] = said(error)
+        for channel, problem in problems.items():
             kind = f"{channel.type} ({problem})" if problem else channel.type
             known = self.topics.get(channel.topic)
             self.topics[channel.topic] = Topic(channel.topic, kind, known.messages if known else 0)

@@ -1,29 +1,42 @@
-"""``foxglove:ws://robot:8765?depth=/camera/depth/image_raw&pose=/odom&frame=map``: depth images from a robot
-that runs, whose ``foxglove_bridge`` sends its topics.
+"""``foxglove:ws://robot:8765?depth=/camera/depth/image_raw&pose=/odom&frame=map``: depth images, or
+``?points=/points`` point clouds, from a robot that runs, whose ``foxglove_bridge`` sends its topics.
 
 Topics, cameras and poses are chosen as in a bag (ros/sensor.py), from what is heard in the first seconds, and
-by the same options. The pose of an image is interpolated as soon as the next pose has come. Of the images
-whose poses are known the newest is the next frame: where mapping is slower than the camera, older ones are
-skipped.
+by the same options. How messages become frames is in stream.py.
 """
 
 import time
 import weakref
-from collections import deque
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from taichi_mrf.datasets.base import Dataset, EndlessNames
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.depth_scale import check_metres
+from taichi_mrf.datasets.lidar.scans import reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.bag import BagSummary, summary_of
-from taichi_mrf.datasets.ros.sensor import DepthCamera, DepthChoice, find_depth_camera
-from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry
+from taichi_mrf.datasets.ros.bag import (
+    BagSummary,
+    by_body_axes,
+    may_be_body_axes,
+    summary_of,
+    turned_axes,
+)
+from taichi_mrf.datasets.ros.beside import COLOR_GAP, find_colors
+from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
+from taichi_mrf.datasets.ros.poses import BagPoses
+from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
 from taichi_mrf.datasets.timed_poses import largest_gap
-from taichi_mrf.datasets.wires.foxglove import FoxgloveClient, wait_until
-from taichi_mrf.datasets.wires.heard import DEPTH_NEEDS, Heard, HeardTopics
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
+from taichi_mrf.datasets.wires.heard import NEEDED, HeardTopics
+from taichi_mrf.datasets.wires.stream import CameraRobot, LidarRobot, Robot
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 
@@ -33,107 +46,17 @@ LISTEN_S = 2.0
 DECIDE_S = 3.0
 """So much longer it is tried to find out what is mapped."""
 
-LATE_S = 1.0
-"""Poses come at most so much later than the largest gap allows; an image that has none by then gets none."""
-
-SILENCE_S = 10.0
-"""A robot that sends no image that can be mapped for so long has ended, for who waits for one."""
+_LOOKED_AT = 4
+"""Images whose numbers are looked at when a robot is opened."""
 
 ENDLESS = "a robot never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
-
-
-@dataclass
-class Robot(Dataset):
-    """The depth images of a robot that runs. ``skipped`` counts those that were older than the newest,
-    ``dropped`` those without a pose."""
-
-    heard: HeardTopics = field(kw_only=True)
-    mapped: DepthCamera = field(kw_only=True)
-    depth_scale: float | None = None
-    gap: float = 0.0
-    skipped: int = 0
-
-    def __post_init__(self) -> None:
-        self._came = 0
-        self._unposed: deque[tuple[int, Entry, Any]] = deque()
-        self._next: tuple[int, Entry, Any, Pose] | None = None
-        self._now_ns = 0
-        depth = self.heard.topics[self.mapped.depth.name]
-        for entry in self.mapped.sensor.entries:
-            self._take([(depth, entry, self.heard.read(depth.name, entry))])
-        self.heard.forget()
-
-    @property
-    def endless(self) -> bool:
-        """A robot never ends."""
-        return True
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The numbers of messages."""
-        return EndlessNames()
-
-    def awaiting(self) -> str:
-        """Why there is no frame."""
-        self._take(self.heard.hear())
-        if self._next is not None:
-            return ""
-        if self.heard.client.problem:
-            return f"the robot: {self.heard.client.problem}"
-        skipped, dropped = self.skipped + self.heard.client.dropped, self.dropped
-        counted = [f"{skipped} skipped, as mapping is slower"] if skipped else []
-        counted += [f"{dropped} left out: no poses within {self.gap:g} s on both sides"] if dropped else []
-        counted += [self.heard.problem] if self.heard.problem else []
-        return f"the next image of {self._came}" + (f" ({'; '.join(counted)})" if counted else "")
-
-    def read(self, index: int) -> Frame:
-        """The newest image with a pose, whatever the index. Raises DatasetError if none comes for SILENCE_S
-        seconds, FrameError for one that cannot be decoded."""
-        if not wait_until(lambda: not self.awaiting(), SILENCE_S):
-            why = f"nothing to map for {SILENCE_S:g} s: waiting for {self.awaiting()}"
-            raise DatasetError(f"{self.heard.path}: {why}")
-        assert self._next is not None
-        number, entry, message, T_world_camera = self._next
-        self._next = None
-        where = f"{self.heard.path}: topic {self.mapped.depth.name}"
-        try:
-            depth_m, camera = self.mapped.cameras.measured(message, entry, self.depth_scale, where)
-        except DatasetError as error:
-            raise FrameError(f"frame {number:06d}: {error}") from error
-        return Frame(depth_m, T_world_camera, camera, entry.stamp, f"{number:06d}")
-
-    def _take(self, heard: Sequence[Heard]) -> None:
-        """Take what has come: images wait for their poses."""
-        for topic, entry, message in heard:
-            self._now_ns = max(self._now_ns, entry.recorded_ns)
-            if topic.name == self.mapped.depth.name:
-                self._unposed.append((self._came, entry, message))
-                self._came += 1
-            else:
-                for poses in self.mapped.poses.values():
-                    poses.hear(topic, entry, message)
-        while self._unposed and self._is_decided(self._unposed[0][1]):
-            number, entry, message = self._unposed.popleft()
-            pose = self.mapped.poses[entry.frame].at(entry.stamp, self.gap)
-            if pose is None:
-                self.dropped += 1
-                continue
-            self.skipped += self._next is not None
-            self._next = number, entry, message, pose
-
-    def _is_decided(self, entry: Entry) -> bool:
-        """True if the poses around an image have come, or will not come any more."""
-        poses = self.mapped.poses.get(entry.frame)
-        if poses is None or entry.stamp <= poses.until:
-            return True
-        return self._now_ns - entry.recorded_ns > (self.gap + LATE_S) * NANOSECONDS
 
 
 def open_foxglove(text: str, options: ReadOptions) -> Dataset:
     """Connect to a robot: ``ADDRESS?option=value&...``. Raises DatasetError, which names the address, if it
     cannot be reached, and as a bag does if it is not clear what to map."""
     address, _, query = text.partition("?")
-    chosen = parse_options(DepthChoice, query, f"foxglove:{address}")
+    chosen = parse_options(SensorChoice, query, f"foxglove:{address}")
     if options.track:
         chosen = replace(chosen, poses=TRACK)
     heard = _connected(address)
@@ -150,7 +73,7 @@ def summarise(address: str) -> BagSummary:
     """What a robot sends, from a few seconds of listening. Raises DatasetError."""
     heard = _connected(address)
     try:
-        _listen(heard, _needed(heard, DepthChoice()))
+        _listen(heard, _needed(heard, SensorChoice()))
         return summary_of(heard)
     finally:
         heard.client.close()
@@ -165,12 +88,16 @@ def _connected(address: str) -> HeardTopics:
         raise
 
 
-def _needed(heard: HeardTopics, chosen: DepthChoice) -> list[str]:
-    """The topics that tell what is mapped; images of one topic only, if the user has named it."""
-    named = chosen.depth if chosen.depth in heard.topics else f"/{chosen.depth}"
-    images = [topic.name for topic in heard.topics.values() if topic.type in messages.IMAGES]
-    others = [topic.name for topic in heard.topics.values() if topic.type in DEPTH_NEEDS]
-    return [name for name in others if name not in images or not chosen.depth or name == named]
+def _needed(heard: HeardTopics, chosen: SensorChoice) -> list[str]:
+    """The topics that tell what is mapped; of images and clouds one only, if the user has named it."""
+    wanted = chosen.points or chosen.depth
+    named = wanted if wanted in heard.topics else f"/{wanted}"
+    return [
+        topic.name
+        for topic in heard.topics.values()
+        if topic.type in NEEDED
+        and (topic.type not in messages.OF_SENSORS or not wanted or topic.name == named)
+    ]
 
 
 def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
@@ -181,37 +108,138 @@ def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
         heard.hear()
 
 
-def _open(heard: HeardTopics, chosen: DepthChoice, options: ReadOptions) -> Robot:
+def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
     _listen(heard, _needed(heard, chosen))
-    mapped = _decided(heard, chosen, options)
-    kept = [mapped.depth.name]
+    robot = _decided(heard, chosen, options)
+    kept = [robot.sensor.topic]
+    if isinstance(robot, CameraRobot):
+        kept += [name for name in (robot.mapped.cameras.topic, robot.colors and robot.colors.topic) if name]
     if chosen.poses != TRACK and not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
     heard.ask_for(kept)
-    notes = [*mapped.sensor.notes, *(note for each in mapped.poses.values() for note in each.notes)]
-    return Robot(
-        name=str(heard.path),
-        camera=mapped.cameras.first,
-        notes=[ENDLESS, *dict.fromkeys(notes), *mapped.cameras.notes],
-        distortion=mapped.cameras.distortion,
+    return robot
+
+
+def _parts(
+    heard: HeardTopics, sensor: BagSensor, poses: dict[str, BagPoses], options: ReadOptions
+) -> dict[str, Any]:
+    """The parts of a robot that are the same for all sensors."""
+    notes = [*sensor.notes, *(note for each in poses.values() for note in each.notes)]
+    return {
+        "name": str(heard.path),
+        "notes": [ENDLESS, *dict.fromkeys(notes)],
+        "heard": heard,
+        "sensor": sensor,
+        "poses": poses,
+        "gap": largest_gap(options),
+    }
+
+
+def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    mapped = find_depth_camera(heard, chosen, options)
+    depth, sensor, cameras, poses = mapped
+    gap, colors = COLOR_GAP if options.max_time_gap is None else options.max_time_gap, None
+    if options.depth_scale is None:
+        first = [heard.read(depth.name, entry) for entry in sensor.entries[:_LOOKED_AT]]
+        check_metres(_readable(first), f"{heard.path}: topic {depth.name}")
+    poses, said = _by_axes(heard, mapped, chosen, options)
+    if options.color:
+        stamps = [entry.stamp for entry in sensor.entries]
+        colors, words = find_colors(sensor, chosen.color, depth, cameras.first, stamps, options.max_time_gap)
+        said += [each.partition(";")[0] if colors else each for each in words]
+    parts = _parts(heard, sensor, poses, options)
+    parts["notes"] += [*said, *cameras.notes]
+    return CameraRobot(
+        camera=cameras.first,
+        distortion=cameras.distortion,
         tracked=chosen.poses == TRACK,
-        heard=heard,
         mapped=mapped,
         depth_scale=options.depth_scale,
-        gap=largest_gap(options),
+        colors=colors,
+        color_gap=gap,
+        **parts,
     )
 
 
-def _decided(heard: HeardTopics, chosen: DepthChoice, options: ReadOptions) -> DepthCamera:
-    """What is mapped, as soon as enough has been heard to tell. Raises DatasetError."""
+def _readable(images: Iterable[Any]) -> list[NDArray[np.float32]]:
+    """The numbers of the images that can be decoded."""
+    found = []
+    for image in images:
+        with suppress(DatasetError):  # reported when its frame is read
+            found.append(messages.depth_image(image, None))
+    return found
+
+
+def _by_axes(
+    heard: HeardTopics, mapped: DepthCamera, chosen: SensorChoice, options: ReadOptions
+) -> tuple[dict[str, BagPoses], list[str]]:
+    """The poses of a camera's axes, turned with a note if what was heard so far shows a body's."""
+    depth, sensor, cameras, poses = mapped
+    if not may_be_body_axes(poses, chosen, options):
+        return poses, []
+    gap = largest_gap(options)
+    posed = [(entry, poses[entry.frame].at(entry.stamp, gap)) for entry in sensor.entries]
+    known = [(entry, T) for entry, T in posed if T is not None]
+
+    def metres(index: int) -> NDArray[np.float32]:
+        return messages.depth_image(heard.read(depth.name, known[index][0]), options.depth_scale)
+
+    said = by_body_axes([T for _, T in known], metres, cameras.first, depth.frame)
+    return (_turned(poses), [said]) if said else (poses, [])
+
+
+def _turned(poses: dict[str, BagPoses]) -> dict[str, BagPoses]:
+    """Poses of a body's axes as those of the camera's."""
+
+    def turned(of: BagPoses, stamp: float, gap: float) -> Pose | None:
+        T = of.at(stamp, gap)
+        return None if T is None else turned_axes(T)
+
+    return {frame: replace(each, at=partial(turned, each)) for frame, each in poses.items()}
+
+
+def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    sensor, poses, clouds = find_clouds(heard, chosen, options)
+    parts = _parts(heard, sensor, poses, options)
+    first = _first_cloud(heard, sensor, poses, clouds, parts["gap"])
+    parts["notes"] += [clouds.in_words(first.camera)]
+    return LidarRobot(
+        camera=first.camera,
+        reach_m=reach_of(first.depth_m),
+        tracked=chosen.poses == TRACK,
+        clouds=clouds,
+        **parts,
+    )
+
+
+def _first_cloud(
+    heard: HeardTopics, sensor: BagSensor, poses: dict[str, BagPoses], clouds: Clouds, gap: float
+) -> Frame:
+    """The first cloud that can be read, if possible one with a pose: it tells rays and reach. Raises
+    DatasetError if there is none."""
+    problem: DatasetError | None = None
+    posed = [(entry, poses[entry.frame].at(entry.stamp, gap)) for entry in sensor.entries]
+    for entry, pose in sorted(posed, key=lambda each: each[1] is None):
+        try:
+            message = heard.read(sensor.topic, entry)
+            return clouds.frame(entry, message, np.eye(4) if pose is None else pose, entry.stamp, "")
+        except DatasetError as error:
+            problem = problem or error
+    raise DatasetError(f"{heard.path}: no cloud can be read: {problem}") from problem
+
+
+def _decided(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
+    """The robot, as soon as enough has been heard to tell what is mapped. Raises DatasetError."""
     end = time.monotonic() + DECIDE_S
     while True:
         try:
-            return find_depth_camera(heard, chosen, options)
+            find = _with_lidar if maps_clouds(heard, chosen) else _with_camera
+            return find(heard, chosen, options)
         except DatasetError as error:
             if time.monotonic() > end:
                 silent = [name for name in _needed(heard, chosen) if not heard.topics[name].messages]
                 said = f"; nothing came on {', '.join(silent)} in {heard.duration:.0f} s" if silent else ""
+                said += f"; {heard.problem}" if heard.problem else ""
                 raise DatasetError(f"{error}{said}") from error
         time.sleep(0.1)
         heard.hear()

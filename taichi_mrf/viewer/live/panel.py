@@ -196,6 +196,7 @@ class Panel(BasePanel):
                 "backend": f"{h.backend} ({h.device})",
                 "voxel size": f"{100 * h.voxel_size:g} cm",
                 "frames": f"{status.frame} of {status.frames}" if status.frames else f"{status.frame}",
+                **({"sensor": status.arrivals} if status.arrivals else {}),
                 "keyframes": f"{status.keyframes} ({status.frozen} frozen)",
                 "keyframes per second": f"{status.keyframes_per_second:.1f}",
                 "voxels": f"{status.voxels:,} in {status.bricks:,} bricks",
