@@ -68,6 +68,8 @@ def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceF
     words = ("poses_are", "mounting", "depth_is", "image_is")
     said = conventions_of(*(keywords[word] for word in words))
     as_written = {**keywords, **dict.fromkeys(words), "depth_is": AXIAL}
+    if said.turned or said.along_ray:  # boxes are in the sensor's frame, which is not known yet
+        as_written["body"] = replace(reading.own_body, body_box=())
     dataset: Dataset
     try:
         dataset = open_posed(source, poses, color=False, **as_written)
