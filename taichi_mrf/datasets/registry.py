@@ -26,7 +26,7 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
 from taichi_mrf.datasets.ros.names import is_bag
 from taichi_mrf.datasets.turned import T_sensor_stored, stored_camera
-from taichi_mrf.datasets.without_body import masked, without_boxes
+from taichi_mrf.datasets.without_body import masked, without_body
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
@@ -191,7 +191,7 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     seen = masked(dataset, options.body.mask)
     picked = resampled(seen, distortion, options.stride, conventions.turned)
     picked.tracked = dataset.tracked
-    picked = without_boxes(picked, options.body.body_box, conventions)
+    picked = without_body(picked, options.body, conventions)
     asked = mended(picked, conventions, options.max_time_gap)
     apart = "" if asked.tracked or asked.endless else out_of_sight(asked)
     asked.notes += [f"{apart}; taichi-mrf doctor tells"] if apart else []

@@ -16,7 +16,7 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.derived import Derived, axial_depth
 from taichi_mrf.datasets.images import decode_unchanged
-from taichi_mrf.datasets.own_body import Box
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, naming
 from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.frame import Frame
@@ -69,11 +69,18 @@ def masked(dataset: Dataset, file: str | None) -> Dataset:
     return _without(dataset, partial(_in_mask, body, path), note)
 
 
-def without_boxes(dataset: Dataset, boxes: tuple[Box, ...], conventions: Conventions) -> Dataset:
-    """A dataset without the measurements that end in a box of the sensor's frame. That of its
-    ``conventions`` which is of depth is still to be undone."""
-    if not boxes:
+def without_body(dataset: Dataset, body: OwnBody, conventions: Conventions) -> Dataset:
+    """A dataset without the measurements that end in a box of the sensor's frame, or that the body of a URDF
+    covers. That of its ``conventions`` which is of depth is still to be undone. Raises DatasetError, which
+    names the file, for a URDF or joints that cannot be read."""
+    if body.robot is not None:
+        from taichi_mrf.datasets.robot_model import RobotModel  # late: few have one
+
+        model = RobotModel(body, conventions)
+        dataset = _without(dataset, model.covered, model.note)
+    if not body.body_box:
         return dataset
+    boxes = body.body_box
     note = f"own body: measurements are left out in {len(boxes)} box{'es' * (len(boxes) > 1)}"
     return _without(dataset, partial(_in_boxes, np.reshape(boxes, (-1, 2, 3)), conventions), note)
 

@@ -6,12 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from armed_room import HALF_M, ArmedRoom, T_camera_bar, record, to_bar_m
+from armed_room import HALF_M, ArmedRoom, T_camera_bar, missed_m, record, to_bar_m
+from armed_urdf import write_urdf
 from console import FAST, as_process, assert_refused, taichi_mrf
 from datasets_recordings import write_image
 from scipy.spatial import cKDTree
 
 import taichi_mrf as tm
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.system import runtime
 
@@ -92,3 +94,27 @@ def test_a_mask_that_does_not_fit_is_one_line(room: ArmedRoom, tmp_path: Path) -
     for command in (("map", "--out", str(tmp_path / "out")), ("info",), ("doctor",)):
         done = taichi_mrf(command[0], room.armed, *command[1:], "--mask", mask)
         assert_refused(done, "arm.png: the mask has 80 x 60 pixels", "armed 160 x 120", "as it is stored")
+
+
+def test_an_arm_that_moves_is_not_in_the_map(bare: np.ndarray, tmp_path: Path) -> None:
+    """By its URDF and a table of its joints; what is seen by it at more than 2 cm stays as it is."""
+    pytest.importorskip("yourdfpy")
+    runtime.init("cpu")
+    room = record(tmp_path, [-0.6 + 0.05 * i for i in range(12)])
+    stamps = tm.open_dataset(room.armed).stamps()
+    rows = [f"{stamps[i]},{room.angles[i]}" for i in (0, 11)]
+    joints = tmp_path / "joints.csv"
+    joints.write_text("\n".join(["stamp,elbow", *rows]))
+    urdf = str(write_urdf(tmp_path / "arm.urdf"))
+    flags = ("--robot", urdf, "--camera-link", "optical", "--joints", str(joints))
+    smeared, _ = mapped(tmp_path / "smeared", room.armed)
+    found, said = mapped(tmp_path / "out", room.armed, *flags)
+    assert "grown by 0.02 m" in said
+    assert of_the_bar(smeared, room, bare) > 40
+    assert of_the_bar(found, room, bare) == 0
+    body = OwnBody(robot=urdf, camera_link="optical", joints=str(joints))
+    seen = tm.open_dataset(room.armed, body=body)
+    for index, plain in enumerate(tm.open_dataset(room.plain)):
+        depth_m, missed = seen.read(index).depth_m, missed_m(plain.camera, room.angles[index])
+        np.testing.assert_array_equal(depth_m[missed > 0.022], plain.depth_m[missed > 0.022])
+        assert not depth_m[missed < 0.017].any()

@@ -45,6 +45,12 @@ def to_bar_m(points_m: NDArray[np.floating], angle: float) -> NDArray[np.float64
     return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
 
 
+def missed_m(camera: PinholeCamera, angle: float) -> NDArray[np.float64]:
+    """By how much each pixel's ray misses the bar (H, W): the least distance of many points of it."""
+    places = np.arange(0.1, 0.9, 0.004)[:, None, None, None]
+    return np.min([to_bar_m(camera.rays() * depth_m, angle) for depth_m in places], axis=0)
+
+
 @dataclass(frozen=True)
 class ArmedRoom:
     """Frames of the room alone, the same with the bar before it at its angles, and folders of both."""
