@@ -48,7 +48,7 @@ def run_live(options: Live) -> int:
         page = MapPage(options, print_line, bar, stack)
         tell_first_run(options.printing)
         from taichi_mrf.cli.shared.learn_noise import learn_with_bar
-        from taichi_mrf.runs.folder import write_run
+        from taichi_mrf.runs.folder import NO_HASTE, write_run
         from taichi_mrf.session.session import Session
         from taichi_mrf.session.session_core import Policy
         from taichi_mrf.session.source import open_among, open_source
@@ -102,7 +102,9 @@ def run_live(options: Live) -> int:
                 print_line(f"tracking: {found} frames found, {lost} lost, {result.loops_closed} loops closed")
             whole = request.signal is None and not result.interrupted
             facts = session.state.facts
-            _, written = write_run(options.out, result, facts, check=whole, pictures=whole, haste=request)
+            _, written = write_run(
+                options.out, result, facts, check=whole, pictures=whole, haste=request if whole else NO_HASTE
+            )
             for path in written:
                 print_line(f"wrote {path}")
     page.refuse_early_end()

@@ -89,6 +89,9 @@ class StatedSensor:
     pass_through: float | None = None
     """Chance that a ray passes an occupied voxel; None for the default's 0."""
 
+    swept_m: float = 0.0
+    """How far it moves, turns counted at 10 m, while it takes an image, where nothing undoes that."""
+
 
 StampedPoses = tuple[Sequence[float] | NDArray[np.float64], Sequence[Pose]]
 """Stamps in seconds, and the poses (4, 4) T_world_camera at them."""

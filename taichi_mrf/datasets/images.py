@@ -19,9 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.datasets.turned import turn_hint
+from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
+from taichi_mrf.system.npz_file import read_npy
 from taichi_mrf.system.packed import DEFLATE_RATIO
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -140,6 +142,7 @@ _LARGEST_TILE = 1 << 20
 """Pixels of a tile that is larger than its image; small images have tiles of 256 x 256."""
 
 
+ARRAY = ".npy"
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 """Of depth images that folders may hold."""
 
@@ -155,13 +158,16 @@ MOST_PIXELS = 1 << 27
 def read_depth(
     path: Path, steps_per_metre: float, camera: PinholeCamera | None = None
 ) -> NDArray[np.float32]:
-    """Axial depth in metres, (H, W) float32, from a grey image of 16 bits or of floats, 0 for none.
+    """Axial depth in metres, (H, W) float32, from a grey image of 16 bits or of floats, or from NumPy's array
+    of any numbers (.npy), 0 for none.
 
     Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
     of another size than the camera's.
     """
-    steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
-    if not (steps.ndim == 2 and steps.dtype.kind == "f"):
+    steps = _values(path, camera)
+    if path.suffix == ARRAY and steps.dtype.kind in "ui":
+        steps = measured(steps)
+    elif not (steps.ndim == 2 and steps.dtype.kind == "f"):
         steps = _of_16_bit(steps, str(path))
     return without_filling(steps.astype(np.float32) / np.float32(steps_per_metre))
 
@@ -179,7 +185,7 @@ def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
     """True for a depth image of floats, and the share of its pixels that have the largest whole number;
     (False, 0) for one that cannot be read."""
     try:
-        steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
+        steps = _values(path, camera)
     except DatasetError:  # reported when its frame is read
         return False, 0.0
     return steps.dtype.kind == "f", share_of_largest(steps)
@@ -234,7 +240,7 @@ def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read; a broken one is reported with its frame."""
     for path in paths:
         try:
-            height, width = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
+            height, width = _values(path).shape[:2]
             return width, height
         except DatasetError:
             continue
@@ -279,6 +285,23 @@ def decode_color(data: bytes, where: str, camera: PinholeCamera | None = None) -
     return cv2.cvtColor(_decode(data, where, cv2.IMREAD_COLOR, camera), cv2.COLOR_BGR2RGB)
 
 
+def _values(path: Path, camera: PinholeCamera | None = None) -> NDArray:
+    """The values of an image's file, which may be an array of one number a pixel. Raises DatasetError."""
+    if path.suffix != ARRAY:
+        return _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
+    try:
+        array = read_npy(path)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: not a readable array: {said(error)}") from error
+    image = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    if image.ndim != 2 or image.dtype.kind not in "fui" or not image.size:
+        raise DatasetError(
+            f"{path}: no depth image: expected numbers (H, W), found {array.dtype} {array.shape}"
+        )
+    _check_size(str(path), image.shape[1], image.shape[0], camera)
+    return image
+
+
 def _image_file(path: Path) -> bytes:
     return read_bytes(path, DatasetError, "the image is missing")
 
@@ -308,7 +331,7 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
     if camera is not None and (height, width) != camera.shape:
         raise DatasetError(
             f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
-            + ("; --image-is reads turned images" if (width, height) == camera.shape else "")
+            + turn_hint(camera, (width, height))
             + at_size(camera, width, height)
         )
     if width * height > MOST_PIXELS:

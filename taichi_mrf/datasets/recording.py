@@ -128,7 +128,7 @@ class Recording(Table[RecordedFrame]):
             look_at_depth(frame.depth_file, frame.camera or self.camera)
             for frame in self.rows[::apart][:_LOOKED_AT]
         ]
-        if looked and looked[0][0] and self.scale_source != ASKED:
+        if looked and looked[0][0] and self.scale_source != ASKED and not self.scale_stated:
             self.steps_per_metre, self.scale_source = 1.0, "metres, as the images hold floats"
         own = self.steps_per_metre
         found = gather(

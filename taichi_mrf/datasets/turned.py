@@ -50,9 +50,18 @@ def put_back(stored: NDArray, turned: str) -> NDArray:
 
 
 def of_image_size(recorded: PinholeCamera, size: tuple[int, int] | None, turned: str) -> PinholeCamera:
-    """A camera of stored images of this (width, height), if it states that of the sensor's."""
-    is_exchanged = size is not None and size == recorded.shape and TURNS.get(turned, (0,))[0] % 2
-    return replace(recorded, width=recorded.height, height=recorded.width) if is_exchanged else recorded
+    """A camera of stored images of this (width, height), if it states the sensor's, or one of which they are
+    a smaller copy."""
+    if size is None or not TURNS.get(turned, (0,))[0] % 2 or not turn_hint(recorded, size):
+        return recorded
+    return replace(recorded, width=recorded.height, height=recorded.width)
+
+
+def turn_hint(camera: PinholeCamera, size: tuple[int, int]) -> str:
+    """What an error adds where images of this (width, height) have the camera's, or a smaller copy's,
+    exchanged; empty for others."""
+    is_exchanged = size[0] * camera.width == size[1] * camera.height and size[0] != size[1]
+    return "; --image-is turned-left (or turned-right) reads images that were turned" if is_exchanged else ""
 
 
 def T_sensor_stored(turned: str) -> Pose:

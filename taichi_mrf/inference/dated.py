@@ -13,7 +13,7 @@ sum of any number of them is worth no more than -log l for occupied and log a fo
 What frozen keyframes say is folded for good, which has one order, too. So a keyframe that is frozen before an
 older one leaves its messages, and they wait until no older one is to come. A keyframe that is added after
 newer ones were folded for good is late: the late ones of a brick are folded by themselves, pass through time
-up to what is there, and are added to it.
+up to what is there, and are added to it. They wait for each other.
 
 Messages themselves do not depend on time: their cavities (eq. 6) come from all other keyframes.
 
@@ -180,8 +180,9 @@ class DatedBelief:
             return
         ready = self._waiting
         if slots is None:
-            oldest_s = min((keyframe.stamp_s for keyframe in self._keyframes()), default=np.inf)
-            if min(each.stamp_s for each in self._waiting) > oldest_s:
+            live = list(self._keyframes())
+            oldest_s = min((keyframe.stamp_s for keyframe in live), default=np.inf)
+            if min(each.stamp_s for each in self._waiting) > oldest_s or self._any_late(live):
                 return
             ready = []
             for each in in_time(self._sources()):
@@ -194,6 +195,13 @@ class DatedBelief:
         for each in ready:
             each.left &= ~wanted[each.visible.slots] & self._same(each)
         self._waiting = [each for each in self._waiting if each.left.any()]
+
+    def _any_late(self, keyframes: "Iterable[Keyframe]") -> bool:
+        """True if newer messages than those of one of the keyframes were folded for good. Late ones are
+        folded together, so that none is before all of them are frozen."""
+        assert self.frozen is not None
+        stamps_s = self.frozen.stamp_s
+        return any((stamps_s[k.visible.slots[self._same(k)]] > k.stamp_s).any() for k in keyframes)
 
     def show(self, slots: NDArray[np.int32], belief: NDArray[np.float32], stamp_s: float) -> None:
         """Read these log-odds, (n) -> (n, 512), as of a time until messages change."""

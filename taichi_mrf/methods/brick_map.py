@@ -219,14 +219,16 @@ class BrickMap(Owned):
         none.
 
         A ray ends on the surface that keyframes measured where that is near its likeliest voxel
-        (queries.measured_depth), elsewhere, and in maps without such a surface, in the middle of that voxel.
+        (queries.measured_depth). Elsewhere, and in maps without such a surface, it ends in the middle of that
+        voxel, if it is more likely to be stopped than to pass.
         ``by="omega"`` leaves the surface out: the paper's answer (eq. 18)."""
         check_camera(camera)
         T = as_pose(T_world_camera)
-        depth_m = self.view.render_depth(camera, T, self.sensor.max_depth)
+        likeliest_m, stopped = self.view.likeliest_depth(camera, T, self.sensor.max_depth)
+        depth_m = np.where(stopped, likeliest_m, np.float32(np.nan))
         if by == "omega":
             return depth_m
-        near_m = self.measured_depth(depth_m, camera, T)
+        near_m = self.measured_depth(likeliest_m, camera, T)
         return np.where(np.isnan(near_m), depth_m, near_m)
 
     @tensors.in_kind("likeliest_m", "T_world_camera")

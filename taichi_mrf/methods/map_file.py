@@ -41,13 +41,15 @@ if TYPE_CHECKING:
 else:
     (free,) = later("taichi_mrf.queries", "free")
 
-FORMAT = 3
-"""The newest format. Format 2 added the manifest, format 3 cameras that are no pinholes."""
+FORMAT = 4
+"""The newest format. Format 2 added the manifest, format 3 cameras that are no pinholes, format 4 messages of
+frozen keyframes that wait for older ones."""
 
-PINHOLE_FORMAT = 2
-"""The format that is written where all cameras are pinholes, so that earlier versions can read it."""
+CAMERAS_FORMAT, PINHOLE_FORMAT = 3, 2
+"""The formats that are written where no messages wait, and where all cameras are pinholes, too: earlier
+versions can read these."""
 
-READABLE = (1, 2, 3)
+READABLE = (1, 2, 3, 4)
 """The formats that can be read."""
 
 NUMBERS = "keyframe_camera_numbers"
@@ -123,7 +125,7 @@ class MapHeader:
         keyframes = self.keyframes
         cameras = camera_arrays([k.camera for k in keyframes])
         arrays: dict[str, NDArray] = {
-            "format": np.asarray(FORMAT if NUMBERS in cameras else PINHOLE_FORMAT),
+            "format": np.asarray(CAMERAS_FORMAT if NUMBERS in cameras else PINHOLE_FORMAT),
             "method": np.asarray(self.config.method),
             "config": np.asarray(to_yaml(self.config)),
             "keyframe_ids": np.array([k.id for k in keyframes], np.int64),

@@ -145,14 +145,22 @@ class View:
         return View(self.pool, self.voxel_size, self.volume, *rules)
 
     def render_depth(self, camera: Camera, T_world_camera: Pose, max_depth: float) -> NDArray[np.float32]:
-        """(H, W) axial depth in metres, NaN where the ray is more likely to pass than to be stopped.
+        """(H, W) axial depth in metres, NaN where the ray is more likely to pass than to be stopped."""
+        likeliest_m, stopped = self.likeliest_depth(camera, T_world_camera, max_depth)
+        return np.where(stopped, likeliest_m, np.float32(np.nan))
+
+    def likeliest_depth(
+        self, camera: Camera, T_world_camera: Pose, max_depth: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Axial depth (H, W) in metres of the likeliest voxel, NaN where a ray meets none, and whether the
+        ray is more likely to be stopped than to pass, (H, W).
 
         What was never seen dims a ray, but is no surface.
         """
         learnt = self.pool.prior_log_odds + self.volume.min_evidence
         survey = self._survey(camera, T_world_camera, max_depth, learnt, self.occlusion, None, _NO_NOISE)
-        surface = (survey.visibility < 0.5) & (survey.far > 0)
-        return np.where(surface, survey.middle, np.float32(np.nan))
+        met = survey.far > 0
+        return np.where(met, survey.middle, np.float32(np.nan)), met & (survey.visibility < 0.5)
 
     def survey(
         self,

@@ -18,10 +18,10 @@ def holds_run(folder: Path) -> bool:
 
 
 def remove_files_of_earlier_run(folder: Path, written: list[Path]) -> None:
-    """Remove the pictures, the trajectory, the learnt noise and the map in chunks that the present run has
-    not ``written``: they show a run that it replaced."""
+    """Remove the voxels, pictures, trajectory, learnt noise and map in chunks that the present run has not
+    ``written``: they show a run that it replaced."""
     if folder / WINDOW_FOLDER not in written:
         shutil.rmtree(folder / WINDOW_FOLDER, ignore_errors=True)
-    for name in (*PICTURE_FILES, TRAJECTORY_FILE, NOISE_FILE):
+    for name in (VOXEL_FILE, *PICTURE_FILES, TRAJECTORY_FILE, NOISE_FILE):
         if folder / name not in written:
             (folder / name).unlink(missing_ok=True)

@@ -63,21 +63,20 @@ Advance = Callable[[str, int, int], None]
 
 
 class Haste(Protocol):
-    """Interface to ask if a run has to end within seconds, as after SIGTERM."""
+    """Interface to ask if a run is to end with what it has, as after Ctrl-C."""
 
-    @property
-    def hurried(self) -> bool:
-        """True if the run has to end."""
+    def __call__(self) -> bool:
+        """True if the run is to end."""
         ...
 
     def cutting_short(self) -> AbstractContextManager[None]:
-        """A block in which CutShortError is raised as soon as it has to; the block may be left at any
-        point."""
+        """A block in which CutShortError is raised as soon as it is; the block may be left at any point."""
         ...
 
 
 class _NoHaste:
-    hurried = False
+    def __call__(self) -> bool:
+        return False
 
     def cutting_short(self) -> AbstractContextManager[None]:
         return nullcontext()
@@ -110,7 +109,8 @@ class RunFacts:
         """The report of the finished run."""
         report = run_report(result, self.dataset, self.source, check)
         report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
-        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt, mistakes)
+        swept_m = 0.0 if self.dataset is None else self.dataset.stated.swept_m
+        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt, mistakes, swept_m)
         told = (str(warning.message) for warning in self.warned)
         report["notes"] = list(dict.fromkeys([*report["notes"], *told]))
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
@@ -134,8 +134,9 @@ def write_run(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
-    with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
-    an earlier run are removed.
+    with ``pictures`` it is drawn, if it is in memory as a whole. In ``haste`` all but the map, its parameters
+    and the report is left out, as a note says, and the run counts as interrupted: resumed, it makes them.
+    Files of an earlier run are removed.
 
     Returns the report and the paths; ``refused`` in the report is why the map is not to be used, of which
     ``mistakes_of`` the recording say what mends it. Raises MapFileError.
@@ -143,9 +144,9 @@ def write_run(
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
-    if check and posed is not None and not haste.hurried:
+    if check and posed is not None and not haste():
         _calibrate(result, posed, advance)
-    written, occupied = _write_map(folder, result, facts.config, advance)
+    written, occupied = _write_map(folder, result, facts.config, haste, advance)
     chunked = in_chunks(result.map)
     found, noise = None, None
     if check and posed is not None:
@@ -158,21 +159,22 @@ def write_run(
             default = is_default_noise(posed, facts.config.sensor)
             frames = [found.kept[index][0] for index in judged if index in found.kept]
             noise = _check_noise(result, frames, haste, DOUBTED if default else CONTRADICTED)
-        if not haste.hurried and not result.interrupted:
+        if not haste() and not result.interrupted:
             advance("Poses", 0, 1)
             with result.timed("checking"):
                 result.check_steps()
+    drawn: list[Path] = []
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
     seen: list[str] = []
     unanswered = 0.0 if found is None else found.error.unanswered
-    if posed is not None and (contradicts(noise) or unanswered > _MOST_UNANSWERED) and not haste.hurried:
+    if posed is not None and (contradicts(noise) or unanswered > _MOST_UNANSWERED) and not haste():
         with result.timed("checking"):
             seen = mistakes_of(posed)
     report = facts.report(result, found, noise, seen)
     if seen and not contradicts(noise):
         share = f"{unanswered:.0%} of the held-out pixels have no answer in the map"
         report["notes"].append(f"{share}: {'; '.join(seen)}.")
-    if not occupied:
+    if occupied == 0:
         report["refused"] = _nothing_occupied(facts.config, posed)
         report["notes"].append(report["refused"])
     elif contradicts(noise) or seen:
@@ -180,10 +182,16 @@ def write_run(
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
-        written += _write_pictures(folder, result, posed, found, haste, advance)
+        drawn = _write_pictures(folder, result, posed, found, haste, advance)
+        written += drawn
     if facts.learnt is not None:
         write_text(folder / NOISE_FILE, sensor_yaml(facts.config.sensor, facts.source, facts.learnt))
         written.append(folder / NOISE_FILE)
+    if haste():
+        report["interrupted"] = True
+        report["notes"] += _left_out(
+            voxels=occupied is None, check=check and found is None, pictures=pictures and not drawn
+        )
     remove_files_of_earlier_run(folder, written)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
     write_text(folder / REPORT_FILE, report_json(report))
@@ -230,17 +238,21 @@ def _nothing_occupied(config: Config, dataset: Dataset | None) -> str:
 
 
 def _write_map(
-    folder: Path, result: MappingResult, config: Config, advance: Advance
-) -> tuple[list[Path], int]:
-    """Returns the paths and the number of occupied voxels."""
+    folder: Path, result: MappingResult, config: Config, haste: Haste, advance: Advance
+) -> tuple[list[Path], int | None]:
+    """Returns the paths and the number of occupied voxels, None if they are left out: to find them takes ten
+    times as long as to save the map."""
     advance("Writing", 0, 2)
+    occupied = None
     with result.timed("writing"):
         result.map.save(folder / MAP_FILE)
         write_text(folder / CONFIG_FILE, commented_yaml(config))
         advance("Writing", 1, 2)
-        occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
+        written = [folder / MAP_FILE, folder / CONFIG_FILE]
+        if not haste():
+            occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
+            written.insert(1, folder / VOXEL_FILE)
         advance("Writing", 2, 2)
-        written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
         if window_of(result.map) is not None:
             written.append(folder / WINDOW_FOLDER)
         if result.track is not None:
@@ -252,6 +264,13 @@ def _write_map(
     return written, occupied
 
 
+def _left_out(voxels: bool, check: bool, pictures: bool) -> list[str]:
+    """A note on what a run that was stopped did not make; none if it made all."""
+    parts = {VOXEL_FILE: voxels, "the check against held-out frames": check, "the pictures": pictures}
+    missing = ", ".join(part for part, is_missing in parts.items() if is_missing)
+    return [f"Left out, because the run was stopped: {missing}; --resume makes it."] if missing else []
+
+
 def _check(
     result: MappingResult,
     dataset: Dataset,
@@ -261,11 +280,11 @@ def _check(
     keep: Collection[int],
 ) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
-    if not result.held_out or haste.hurried:
+    if not result.held_out or haste():
         return None
 
     def checked(number: int) -> None:
-        if haste.hurried:
+        if haste():
             raise CutShortError
         advance("Checking", number, len(result.held_out))
 
@@ -297,7 +316,7 @@ def _check_noise(
     """None if the frames that were held out do not tell, or if the run has to end before they do."""
 
     def checked() -> None:
-        if haste.hurried:
+        if haste():
             raise CutShortError
 
     try:

@@ -53,8 +53,10 @@ def noise_notes(
     check: NoiseCheck | None,
     learnt: LearntSigma | None,
     mistakes: Sequence[str] = (),
+    swept_m: float = 0.0,
 ) -> list[str]:
-    """Notes on a run's noise; ``mistakes`` are those that a doctor finds if recording and map disagree."""
+    """Notes on a run's noise; ``mistakes`` are those that a doctor finds if recording and map disagree, and
+    ``swept_m`` is how far the sensor moves during an image (StatedSensor)."""
     notes = []
     if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
         notes.append(f"The noise of depth stays as stated: {learnt.frames} held-out frames agree with it.")
@@ -74,7 +76,7 @@ def noise_notes(
         notes.append(
             f"The measured depths of {check.frames} held-out frames differ from the map by "
             f"{check.factor:.2g} times what {_noise_name(sensor)} allows{_better(check.law)}. "
-            f"{_advice(sensor, learnt, check)}"
+            f"{_advice(sensor, learnt, check)}{_sweep_words(swept_m)}"
         )
     elif check is not None and check.factor > HIDDEN and check.gain > LEAST_HIDDEN_GAIN:
         notes.append(
@@ -84,6 +86,15 @@ def noise_notes(
             "voxels tell more."
         )
     return notes
+
+
+def _sweep_words(swept_m: float) -> str:
+    if not swept_m:
+        return ""
+    return (
+        f" Or scans were not deskewed: the lidar moves by {swept_m:.2g} m, turns counted at 10 m, in 0.1 s, "
+        "the usual time of a scan, whose points have one pose here. Points with times in a bag are deskewed."
+    )
 
 
 def sensor_yaml(sensor: SensorConfig, source: str, learnt: LearntSigma) -> str:

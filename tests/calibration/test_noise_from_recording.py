@@ -23,7 +23,15 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, NoiseCheck, SigmaLaw
+from taichi_mrf.evaluation.noise_fit import (
+    CONTRADICTED,
+    VOXEL_SPREAD,
+    NoiseCheck,
+    SigmaLaw,
+    check_noise,
+    enough_of,
+)
+from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.sensor.frame import Frame
 
@@ -149,6 +157,32 @@ def test_a_large_factor_is_told_although_voxels_hide_it(factor: float, gain: flo
     notes = noise_notes(SensorConfig(), NoiseCheck(factor, gain, 8, 40_000), None)
     assert len(notes) == said
     assert all("likeliest with 3.4 times" in note and "by 0.012 nats" in note for note in notes)
+
+
+@pytest.mark.usefixtures("one_backend")
+@pytest.mark.parametrize(
+    ("voxel_m", "factor", "words"),
+    [
+        (0.05, 3.0, "differ from the map by 3"),
+        (0.05, 1.5, None),
+        (0.2, 3.0, "voxels are so large that they hide the noise"),
+        (0.2, 1.5, None),
+    ],
+)
+def test_a_recording_of_three_times_the_stated_noise_is_told_and_one_of_half_as_much_is_not(
+    voxel_m: float, factor: float, words: str | None
+) -> None:
+    """Voxels of 5 cm show that noise, those of 20 cm hide most of it."""
+    room = open_dataset("synthetic:room?frames=40&width=160&height=120", color=False)
+    stated = SensorConfig(sigma=tuple(c / factor for c in SensorConfig().sigma))
+    result = map_sequence(room, Config(voxel_m, sensor=stated))
+    frames = [room.read(index) for index in enough_of(result.held_out)]
+    check = check_noise(result.map, frames, most=CONTRADICTED)
+    assert check is not None
+    assert check.wrong == (factor == 3.0 and voxel_m == 0.05)
+    notes = noise_notes(stated, check, None)
+    assert len(notes) == (words is not None)
+    assert all(str(words) in note for note in notes)
 
 
 @pytest.mark.usefixtures("one_backend")

@@ -399,19 +399,44 @@ LONG = "synthetic:room?frames=300&width=80&height=60"
 
 
 def assert_stopped(out: Path) -> None:
-    """A run was stopped early and left its map."""
+    """A run was stopped early and left its map, and nothing that takes long."""
     report = report_of(out)
     assert report["interrupted"] is True
     assert 0 < report["keyframes"] < 270
-    assert {path.name for path in out.iterdir()} == FILES
+    assert {path.name for path in out.iterdir()} == FILES - {"voxels.ply"}
+    assert report["accuracy"] is report["free_space"] is None
+    assert any(
+        note.startswith("Left out, because the run was stopped: voxels.ply") for note in report["notes"]
+    )
 
 
-def test_sigterm_saves_the_map_and_leaves_out_pictures_and_scores(tmp_path: Path) -> None:
-    with signalled(signal.SIGTERM, "Adding", step=3):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_saves_the_map_and_leaves_out_what_takes_long(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with signalled(number, "Adding", step=3):
         done = taichi_mrf("map", LONG, "--out", tmp_path / "out", *COARSE)
-    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    assert done.returncode == 128 + number, done.stderr
     assert_stopped(tmp_path / "out")
-    assert report_of(tmp_path / "out")["accuracy"] is None
+    assert "voxels.ply, the check against held-out frames, the pictures; --resume makes it" in done.stdout
+    assert report_of(tmp_path / "out")["sweeps"] == 1
+
+
+@pytest.mark.parametrize(
+    ("stage", "missing"), [("Writing", "voxels.ply, the check"), ("Drawing", "the pictures")]
+)
+def test_what_a_stop_at_the_end_leaves_out_is_made_by_resume(
+    tmp_path: Path, stage: str, missing: str
+) -> None:
+    with signalled(signal.SIGINT, stage, step=0):
+        done = taichi_mrf("map", ROOM, "--out", tmp_path, *COARSE)
+    assert done.returncode == 130, done.stderr
+    assert f"Left out, because the run was stopped: {missing}" in done.stdout
+    assert report_of(tmp_path)["interrupted"] is True
+    mapped(ROOM, "--out", tmp_path, "--resume")
+    assert report_of(tmp_path)["interrupted"] is False
+    assert report_of(tmp_path)["accuracy"] is not None
+    assert {path.name for path in tmp_path.iterdir()} == FILES | PICTURES
 
 
 @pytest.mark.parametrize(("number", "flags"), [(signal.SIGINT, FAST), (signal.SIGHUP, COARSE)])
@@ -439,8 +464,6 @@ def test_a_process_on_a_terminal_keeps_what_is_mapped(
         os.close(main_end)
     assert process.returncode == {signal.SIGINT: 130}.get(number, 128 + number)
     assert_stopped(tmp_path / "out")
-    if number == signal.SIGHUP:
-        assert report_of(tmp_path / "out")["accuracy"] is None
 
 
 def test_ctrl_c_twice_aborts_and_leaves_nothing(tmp_path: Path) -> None:

@@ -33,17 +33,17 @@ def received(*numbers: int) -> tuple[StopRequest, list[str]]:
     return request, printed
 
 
-def test_ctrl_c_asks_once_and_leaves_time() -> None:
+def test_ctrl_c_asks_once_and_leaves_time_to_infer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
     request, printed = received(signal.SIGINT)
-    assert (request.signal, request.hurried, request.out_of_time()) == (signal.SIGINT, False, False)
-    still = "What is mapped so far is still inferred, saved and checked, as the progress says."
-    assert printed == [f"Stopping. {still} Press Ctrl-C again to abort."]
+    assert (request.signal, request(), request.out_of_time()) == (signal.SIGINT, True, False)
+    assert printed == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_and_sighup_leave_seconds(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     request, printed = received(number)
-    assert (request.signal, request.hurried, request.out_of_time()) == (number, True, False)
+    assert (request.signal, request(), request.out_of_time()) == (number, True, False)
     assert printed == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
     monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
     assert request.out_of_time()
@@ -55,11 +55,14 @@ def test_the_second_of_them_aborts(number: int) -> None:
         received(number, number)
 
 
-def test_a_closed_terminal_may_hang_up_twice_and_sigterm_hurries_a_stopping_run() -> None:
+def test_a_closed_terminal_may_hang_up_twice_and_sigterm_hurries_a_stopping_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     request, printed = received(signal.SIGHUP, signal.SIGHUP)
     assert (request.signal, request.aborted, len(printed)) == (signal.SIGHUP, False, 1)
+    monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
     request, printed = received(signal.SIGINT, signal.SIGTERM)
-    assert (request.signal, request.hurried, request.aborted) == (signal.SIGINT, True, False)
+    assert (request.signal, request.out_of_time(), request.aborted) == (signal.SIGINT, True, False)
     assert len(printed) == 1
 
 
@@ -81,19 +84,20 @@ def test_nohup_is_respected() -> None:
     assert done.stdout == "False\n", done.stderr
 
 
-def test_a_part_that_may_be_left_out_is_left_at_once() -> None:
-    reached = []
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_part_that_may_be_left_out_is_left_at_once(number: int) -> None:
+    reached: list[str] = []
     with stop_on_signals(lambda text: None) as request:
         for _ in range(2):
             with pytest.raises(CutShortError):
-                leave_out(request, reached)
-    assert (request.signal, reached) == (signal.SIGTERM, ["begin"])
+                leave_out(request, number, reached)
+    assert (request.signal, reached) == (number, ["begin"])
 
 
-def leave_out(request: StopRequest, reached: list[str]) -> None:
+def leave_out(request: StopRequest, number: int, reached: list[str]) -> None:
     with request.cutting_short():
         reached.append("begin")
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         reached.append("end")
 
 

@@ -81,9 +81,30 @@ def test_each_column_of_a_scan_has_its_pose(make: Make, unit: str) -> None:
     assert off.max() < 0.02, "poses are interpolated on chords"
     starts = starts_at(camera, np.arange(24), 0) @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(starts, where[:, :3, 3], atol=1e-3)
+    assert not any("deskew" in note for note in open_dataset(path).notes)
     skewed = open_dataset(f"{path}?deskew=false").read(0)
     assert skewed.no_return is not None
     np.testing.assert_allclose(skewed.depth_m[~LOST], np.linalg.norm(seen, axis=-1)[~LOST], rtol=1e-5)
+
+
+def test_a_motion_that_is_left_in_though_points_have_times_is_told(make: Make) -> None:
+    """The lidar drives at 1 m/s and turns by 0.5 rad/s: 0.1 m and 0.05 rad a scan, 0.6 m at 10 m."""
+
+    def opened(query: str, **times: Any) -> LidarBag:
+        scans = [cloud(stamp(scan), points(scan), **times) for scan in range(SCANS)]
+        dataset = open_dataset(f"{make(*scans, drive, kind='mcap')}{query}")
+        assert isinstance(dataset, LidarBag)
+        return dataset
+
+    times = np.tile(np.linspace(-0.04, 0.04, 24, dtype=np.float32), (4, 1))
+    said = "/points: the lidar moves by 0.6"
+    left_in, undone = opened("?deskew=false", time=times), opened("", time=times)
+    assert left_in.notes[-1].startswith(said)
+    assert left_in.notes[-1].endswith("leave out deskew=false")
+    assert left_in.stated.swept_m == pytest.approx(0.6, abs=0.03)
+    assert undone.stated.swept_m == 0.0
+    for other in (undone, opened(""), opened("?deskew=false", time=0 * times)):
+        assert not any(said in note for note in other.notes)
 
 
 def test_free_rays_start_where_their_points_were_measured(make: Make) -> None:

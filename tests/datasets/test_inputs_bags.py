@@ -463,6 +463,26 @@ def test_a_bag_that_is_cut_short_is_named(make: Make, kind: Kind, share: float) 
     refused(path, str(path))
 
 
+@pytest.mark.parametrize(("turned", "quarters"), [("turned-left", 1), ("turned-right", 3)])
+@pytest.mark.parametrize("smaller", [1, 2])
+def test_turned_images_of_a_camera_that_is_not_are_read_with_the_flag_and_refused_without(
+    make: Make, turned: str, quarters: int, smaller: int
+) -> None:
+    """CameraInfo states the sensor's size; images may be smaller copies."""
+
+    def stored(i: int) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(steps(i)[::smaller, ::smaller], quarters))
+
+    path = make(partial(images, image=stored), odometry, mounted)
+    refused(path, "the CameraInfo of", "--image-is turned-left")
+    dataset = open_dataset(path, image_is=turned)
+    assert dataset.camera == CAMERA.scaled(1 / smaller)
+    for i, frame in enumerate(dataset):
+        assert frame.camera == dataset.camera
+        np.testing.assert_allclose(frame.depth_m, steps(i)[::smaller, ::smaller] / 1000, rtol=1e-6)
+        np.testing.assert_allclose(frame.T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
+
+
 def test_a_damaged_image_is_a_broken_frame(make: Make) -> None:
     def damaged(bag: Bag) -> None:
         bag.image(TOPIC, 1.05, FRAME, steps(0)[:6], "16UC1")

@@ -330,3 +330,44 @@ def test_a_packed_log_may_unpack_to_what_its_size_lets_expect(
         open_scans(path, skip_bad_scans=True)
     path.write_bytes(gzip.decompress(path.read_bytes())[:1900])
     assert len(open_scans(path).range_m) == 100
+
+
+MANY = "9" * 5000
+"""More digits than Python makes a number of (sys.get_int_max_str_digits)."""
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        (f"FLASER {MANY} 1 1 0 0 0 0 0 0 1 host 1", rf"'{'9' * 40}' as the number of its ranges"),
+        (f"FLASER 2 1 {MANY} 0 0 0 0 0 0 1 host 1", "the range of beam 2 is inf"),
+        (f"FLASER 2 1 1 {MANY} 0 0 0 0 0 1 host 1", "pose contains a value that is not finite"),
+        (f"ROBOTLASER1 0 -1.5 3.1 {MANY} 9 0.1 0 2 1 1 0 0 0 0", "greatest range is not a usable number"),
+        (
+            f"ROBOTLASER1 0 -1.5 3.1 1.5 9 0.1 0 2 1 1 {MANY} 0 0 0",
+            rf"'{'9' * 40}' as the number of its remi",
+        ),
+    ],
+)
+def test_a_number_of_thousands_of_digits_spoils_its_scan_alone(
+    line: str, problem: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "digits.log"
+    path.write_text(
+        "\n".join([flaser([1.0, 2.0], (0.0, 0.0, 0.0)), line, flaser([3.0, 4.0], (1.0, 0.0, 0.0))])
+    )
+    with pytest.raises(DatasetError, match=problem) as caught:
+        open_scans(path)
+    assert "line 2" in str(caught.value)
+    assert len(str(caught.value)) < 500
+    assert open_scans(path, skip_bad_scans=True).range_m.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+@pytest.mark.parametrize("begin", [b"", b"FLASER 180 ", b"ROBOTLASER1 0 "])
+def test_a_line_of_a_hundred_million_characters_is_named(begin: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "long.log"
+    with path.open("wb") as file:
+        file.write(b"# a comment\n" + begin)
+        file.truncate(100_000_000)
+    with pytest.raises(DatasetError, match=r"long\.log line 2: longer than 10,000,000 bytes"):
+        open_scans(path, skip_bad_scans=True)

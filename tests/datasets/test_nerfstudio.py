@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets_recordings import CAMERA, Content, check_frames, write_nerfstudio
+from datasets_recordings import CAMERA, Content, check_frames, write_image, write_nerfstudio
 from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import FrameError
 
 CONTENT = Content(3)
 
@@ -54,6 +55,59 @@ def test_the_unit_is_the_one_that_is_stated(tmp_path: Path) -> None:
     check_frames(open_dataset(folder), CONTENT, 5000.0, colored=True)
 
 
+@pytest.mark.parametrize(
+    ("dtype", "stored", "factor"),
+    [
+        ("<f4", 1e-3, None),
+        (">f8", 1e-3, 1.0),
+        ("<f4", 1.0, 1e-3),
+        ("<u2", 1.0, None),
+        ("<u2", 5.0, 2e-4),
+        ("<i4", 5.0, 2e-4),
+    ],
+)
+@pytest.mark.parametrize("channels", [(), (1,)])
+def test_depth_may_be_arrays(
+    dtype: str, stored: float, factor: float | None, channels: tuple[int, ...], tmp_path: Path
+) -> None:
+    """``stored`` is what a millimetre is in the arrays."""
+    folder = write_nerfstudio(tmp_path / "walk", CONTENT, depth_unit_scale_factor=factor)
+    for number, depth in enumerate(CONTENT.depth):
+        path = folder / f"depth/frame_{number + 1:05d}.png"
+        path.unlink()
+        array = (depth.astype(np.float64) * stored).astype(dtype)
+        np.save(path.with_suffix(".npy"), array.reshape(*array.shape, *channels))
+        changed(folder, number, depth_file_path=f"depth/{path.stem}.npy")
+    dataset = open_dataset(folder)
+    check_frames(dataset, CONTENT, 1000.0, colored=True)
+    assert dataset.misfit() is None
+
+
+@pytest.mark.parametrize(
+    ("array", "problem"),
+    [
+        (np.zeros((12, 16, 3), np.float32), r"found float32 \(12, 16, 3\)"),
+        (np.zeros((12, 16), complex), "found complex128"),
+        (np.zeros((9, 16), np.float32), "the image has 16 x 9 pixels, the camera 16 x 12"),
+        (np.array([[{}]], object), "no array of plain values"),
+        (b"\x93NUMPY", "not a readable array"),
+        (None, "there is no such file"),
+    ],
+)
+def test_an_array_that_is_no_depth_image_spoils_its_frame_alone(
+    array: Any, problem: str, tmp_path: Path
+) -> None:
+    folder = changed(write_nerfstudio(tmp_path / "walk", CONTENT), 1, depth_file_path="depth/frame_00002.npy")
+    if isinstance(array, bytes):
+        (folder / "depth/frame_00002.npy").write_bytes(array)
+    elif array is not None:
+        np.save(folder / "depth/frame_00002.npy", array, allow_pickle=True)
+    dataset = open_dataset(folder)
+    with pytest.raises(FrameError, match=problem):
+        dataset.read(1)
+    dataset.read(2)
+
+
 @pytest.mark.parametrize("scaled", ["applied_scale", "applied_transform"])
 def test_a_scale_of_the_world_is_undone(scaled: str, tmp_path: Path) -> None:
     folder = write_nerfstudio(tmp_path / "walk", CONTENT)
@@ -81,6 +135,19 @@ def test_frames_without_depth_are_left_out(tmp_path: Path) -> None:
     dataset = open_dataset(folder)
     assert (list(dataset.frame_names), dataset.dropped) == (["frame_00002", "frame_00003"], 1)
     assert dataset.notes[0] == "1 of 3 images dropped: transforms.json names no depth image for them"
+
+
+@pytest.mark.parametrize(("turned", "quarters"), [("turned-left", 1), ("turned-right", 3)])
+def test_turned_images_of_a_camera_that_is_not_are_read_with_the_flag_and_refused_without(
+    turned: str, quarters: int, tmp_path: Path
+) -> None:
+    """``w`` and ``h`` are the sensor's, of twice the pixels of depth along each side."""
+    folder = write_nerfstudio(tmp_path / "walk", CONTENT)
+    for number, depth in enumerate(CONTENT.depth):
+        stored = np.ascontiguousarray(np.rot90(depth, quarters))
+        write_image(folder / f"depth/frame_{number + 1:05d}.png", stored)
+    refused(folder, "depth of 12 x 16 pixels", "--image-is turned-left")
+    check_frames(open_dataset(folder, image_is=turned, color=False), CONTENT, 1000.0)
 
 
 def test_a_lens_is_undone(tmp_path: Path) -> None:

@@ -244,6 +244,8 @@ def test_files_keep_what_waits(tmp_path: Path) -> None:
     for id in (3, 1):
         m.freeze_keyframe(id)
     m.save(tmp_path / "map.npz")
+    # Earlier versions would pass over the messages that wait: they refuse the file.
+    assert format_of(tmp_path / "map.npz") == 4
     loaded = MRFMap.load(tmp_path / "map.npz")
     assert_equal_bits(loaded, m)
     assert_equal_bits(loaded, kept)
@@ -254,6 +256,36 @@ def test_files_keep_what_waits(tmp_path: Path) -> None:
         for id in (2, 0):
             each.freeze_keyframe(id)
     assert_equal_bits(loaded, m)
+    m.save(tmp_path / "map.npz")
+    assert format_of(tmp_path / "map.npz") == 2
+
+
+def format_of(path: Path) -> int:
+    with np.load(path) as file:
+        return int(file["format"])
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("read_between", [False, True])
+def test_late_keyframes_may_be_frozen_in_any_order(read_between: bool) -> None:
+    """Two that are older than all that was frozen, with queries between the steps or without."""
+    found = []
+    for order in ((0, 1), (1, 0)):
+        m = dated_room([2, 3])
+        for id in (0, 1):
+            m.freeze_keyframe(id)
+        late = []
+        for i in (0, 1):
+            late.append(add(m, i))
+            if read_between:
+                m.decided.occupancy(np.zeros((1, 3)))
+        m.infer()
+        for k in order:
+            m.freeze_keyframe(late[k])
+            if read_between:
+                beliefs(m)
+        found.append(m)
+    assert_equal_bits(*found)
 
 
 @pytest.mark.usefixtures("backend")

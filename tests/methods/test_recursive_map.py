@@ -299,7 +299,7 @@ def test_an_older_map_that_names_no_method_is_an_mrf_map(tmp_path: Path) -> None
         ("belief", None, "belief is missing"),
         ("belief", np.zeros((1, 512), np.float32), r"belief is float32 \(1, 512\); expected \(\d+, 512\)"),
         ("method", np.asarray("magic"), "method .magic., which is not registered"),
-        ("format", np.asarray(99), "format 99, by a newer version; this version reads formats 1 to 3"),
+        ("format", np.asarray(99), "format 99, by a newer version; this version reads formats 1 to 4"),
     ],
 )
 def test_a_damaged_map_is_refused(tmp_path: Path, name: str, value: np.ndarray | None, message: str) -> None:

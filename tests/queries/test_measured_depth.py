@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_mrf import MRFMap, PolynomialNoise
 from taichi_mrf.queries.measured_depth import NONE, MeasuredDepth
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.voxels.distance_field import DistanceField, blended_sums
@@ -149,3 +150,20 @@ def test_a_field_of_sums_that_lie_together_is_the_same() -> None:
         for each in (DistanceField.of(field.bricks, field.sums), field)
     )
     np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_ray_that_may_pass_ends_on_the_measured_surface_alone() -> None:
+    """In fine voxels a surface is spread so far that rays are likelier to pass it than not."""
+    draw, sigma_m = np.random.default_rng(0), 0.02
+    m = MRFMap(0.05, PolynomialNoise(sigma=(sigma_m,)), max_depth=3.0)
+    for _ in range(3):
+        noisy_m = 1.0 + sigma_m * draw.standard_normal(CAMERA.shape)
+        m.add_keyframe(noisy_m.astype(np.float32), np.eye(4), CAMERA)
+    m.infer()
+    m.view = m.view.with_occlusion(most=-4.0)  # no voxel stops more than one ray in fifty
+    assert np.isnan(m.render_depth(CAMERA, np.eye(4), by="omega")).all()
+    depth_m = m.render_depth(CAMERA, np.eye(4))
+    np.testing.assert_allclose(np.nanmedian(depth_m), 1.0, atol=sigma_m)
+    assert np.isfinite(depth_m).mean() > 0.8
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    assert np.isnan(m.render_depth(CAMERA, away)).all()

@@ -12,11 +12,10 @@ from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, READ_WRONG, Terminal, pr
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses
 from taichi_mrf.mapping.rounds import RoundStep
-from taichi_mrf.runs.files import MAP_FILE
+from taichi_mrf.runs.files import MAP_FILE, VOXEL_FILE
 from taichi_mrf.runs.report import report_json
 
-LOOK_AT_PICTURES = "Look at the .png files, or open"
-OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
+OPEN_VOXELS = "Look at the .png files, or open voxels.ply in MeshLab, CloudCompare or Blender. "
 KEPT = "The files are kept; --force ends without this error."
 LIVE_VIEW = "shows the map in the browser."
 
@@ -67,9 +66,10 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
     if not options.force:  # it is the error that the command ends with
         report = {**report, "notes": [note for note in report["notes"] if note != report["refused"]]}
     print_report(console, report, written)
-    look = LOOK_AT_PICTURES if any(path.suffix == ".png" for path in written) else "Open"
-    live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
-    console.print(f"{look} {OPEN_VOXELS} {live}")
+    look = OPEN_VOXELS if any(path.name == VOXEL_FILE for path in written) else ""
+    if not any(path.suffix == ".png" for path in written):
+        look = look.replace("Look at the .png files, or open", "Open")
+    console.print(f"{look}taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}")
 
 
 def print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:

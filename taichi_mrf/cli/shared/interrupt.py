@@ -1,8 +1,8 @@
 """Signals that stop a run and keep its work.
 
-The first Ctrl-C asks a run to finish early, the second aborts it. SIGTERM asks it to end within seconds,
-because containers and schedulers kill it after ten: pictures and scores are left out. SIGHUP, which a broken
-connection or a closed terminal sends, means the same, however often it is sent.
+The first Ctrl-C asks a run to save what it has and to end, the second aborts it. SIGTERM asks the same within
+seconds, because containers and schedulers kill it after ten: inference is cut short, too. SIGHUP, which a
+broken connection or a closed terminal sends, means what SIGTERM means, however often it is sent.
 """
 
 import contextlib
@@ -24,14 +24,14 @@ _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
 class StopRequest:
-    """Request to end the run, and how; an instance is called to ask if there is one."""
+    """Request to end the run with what it has, and how; an instance is called to ask if there is one."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
         """The signal that came first."""
         self.aborted = False
         """True if the user has asked the run to end at once, without its results."""
-        self._hurried_at: float | None = None
+        self._killed_from: float | None = None  # the time of SIGTERM or SIGHUP
         self._cuts_short = False
 
     def __call__(self) -> bool:
@@ -42,22 +42,17 @@ class StopRequest:
         """0, or what a shell expects of a program that was stopped by a signal."""
         return 0 if self.signal is None else 128 + self.signal
 
-    @property
-    def hurried(self) -> bool:
-        """True if the run has to end within seconds (SIGTERM, SIGHUP)."""
-        return self._hurried_at is not None
-
     def out_of_time(self) -> bool:
-        """True if computing has to end now, so that enough time is left to save."""
-        return self._hurried_at is not None and time.monotonic() - self._hurried_at > INFER_SECONDS
+        """True if computing has to end now, so that enough time is left to save (SIGTERM, SIGHUP)."""
+        return self._killed_from is not None and time.monotonic() - self._killed_from > INFER_SECONDS
 
     @contextmanager
     def cutting_short(self) -> Iterator[None]:
-        """For a block that may be left at any point: CutShortError is raised in it as soon as the run has to
-        end within seconds."""
+        """For a block that may be left at any point: CutShortError is raised in it as soon as the run is to
+        end."""
         self._cuts_short = True
         try:
-            if self.hurried:
+            if self():
                 raise CutShortError
             yield
         finally:
@@ -76,19 +71,18 @@ class StopRequest:
         """Note a signal; returns whether it changes anything. Raises KeyboardInterrupt if it aborts."""
         if number == _HANG_UP:
             _let_go_of_the_terminal()
-        hurries = number != signal.SIGINT
-        repeated = self() and (self.hurried or not hurries)
+        kills = number != signal.SIGINT
+        repeated = self() and (self._killed_from is not None or not kills)
         if repeated and number != _HANG_UP:
             self.aborted = True
             raise KeyboardInterrupt
-        if hurries and not self.hurried:
-            self._hurried_at = time.monotonic()
-            if self._cuts_short:
-                self.signal = self.signal or number
-                raise CutShortError
-        if self.signal is not None:
+        if kills and self._killed_from is None:
+            self._killed_from = time.monotonic()
+        if self():
             return False
         self.signal = number
+        if self._cuts_short:
+            raise CutShortError
         return True
 
 
@@ -114,12 +108,7 @@ def _handled(announce: Callable[[str], None], keeps: bool, raise_at_once: bool) 
     announcing: list[threading.Thread] = []
 
     def announce_outcome() -> None:
-        if not keeps:
-            outcome = "Nothing is saved: there is no --out."
-        elif request.hurried or raise_at_once:
-            outcome = "What is done so far is saved."
-        else:
-            outcome = "What is mapped so far is still inferred, saved and checked, as the progress says."
+        outcome = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
         with contextlib.suppress(OSError):  # the terminal may be gone
             announce(f"Stopping. {outcome} Press Ctrl-C again to abort.")
 

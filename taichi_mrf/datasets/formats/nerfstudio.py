@@ -1,11 +1,12 @@
 """Nerfstudio's layout, in which Polycam, Record3D and others export depth: transforms.json and its images.
 
 ``frames`` has for each image ``transform_matrix``, T_world_camera with x right, y up and z backwards, and
-``depth_file_path``, 16-bit or float depth along the axis, which may have fewer pixels than the colour image
-``file_path``. ``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy`` (or ``camera_angle_x``) and the lens (``k1``,
-``k2``, ``p1``, ``p2``, ``k3``) are those of the colour image; a frame's own replace those of the file.
-``depth_unit_scale_factor`` are the metres of a step, a millimetre where it is missing. Poses stay where
-``applied_transform`` has moved them; if it or ``applied_scale`` has scaled them, that is undone.
+``depth_file_path``, depth along the axis, an image of 16 bits or floats or an array (``.npy``), which may
+have fewer pixels than the colour image ``file_path``. ``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy`` (or
+``camera_angle_x``) and the lens (``k1``, ``k2``, ``p1``, ``p2``, ``k3``) are those of the colour image; a
+frame's own replace those of the file. ``depth_unit_scale_factor`` are the metres of a step; where it is
+missing, floats are metres and whole numbers millimetres. Poses stay where ``applied_transform`` has moved
+them; if it or ``applied_scale`` has scaled them, that is undone.
 """
 
 import json
@@ -25,6 +26,7 @@ from taichi_mrf.datasets.images import first_size
 from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, beside, first_file, recording
+from taichi_mrf.datasets.turned import of_image_size, turn_hint
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -64,8 +66,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     lenses = {_lens(where, {**values, **frame}) for where, frame in with_depth}
     if len(lenses) > 1:
         raise DatasetError(f"{path}: its frames have different lenses ({', '.join(_LENS)}); one is read")
-    size = first_size(files[place] for place in order)
-    cameras = own_cameras([_of_depth(path, camera, size) for camera in color_cameras], options)
+    size, turned = first_size(files[place] for place in order), options.conventions.turned
+    cameras = own_cameras([_of_depth(path, camera, size, turned) for camera in color_cameras], options)
     scales = _applied_scales(path, values)
     rows = []
     for stamp, place in enumerate(order):
@@ -82,7 +84,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
                 camera=cameras[place],
             )
         )
-    recorded = _of_depth(path, color_cameras[order[0]], size)
+    recorded = _of_depth(path, color_cameras[order[0]], size, turned)
     factor = values.get("depth_unit_scale_factor")
     steps = STEPS_PER_METRE if factor is None else 1 / _positive(path, "depth_unit_scale_factor", factor)
     (lens,) = lenses
@@ -148,15 +150,16 @@ def _camera(where: str, values: Entry) -> PinholeCamera:
         return PinholeCamera(int(w), int(h), fl_x, fl_y, cx, cy)
 
 
-def _of_depth(path: Path, camera: PinholeCamera, size: tuple[int, int] | None) -> PinholeCamera:
+def _of_depth(path: Path, camera: PinholeCamera, size: tuple[int, int] | None, turned: str) -> PinholeCamera:
     """The camera of depth images of this (width, height), which show what colour images show."""
     if size is None:
         return camera
+    camera = of_image_size(camera, size, turned)
     scaled = camera.scaled(size[0] / camera.width)
     if (scaled.width, scaled.height) != size:
         raise DatasetError(
             f"{path}: depth of {size[0]} x {size[1]} pixels has other proportions than w and h, "
-            f"{camera.width} x {camera.height}"
+            f"{camera.width} x {camera.height}{turn_hint(camera, size)}"
         )
     return scaled
 

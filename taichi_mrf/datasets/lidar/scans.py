@@ -10,6 +10,7 @@ row then holds what was measured first. Such pixels are put beyond the image's o
 that time and the sensor's place run on along every row, and neighbours are neighbours.
 """
 
+import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -160,10 +161,12 @@ _REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
 
 @dataclass
 class LidarRecording(Dataset):
-    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read.
+    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read, and
+    ``swept_m`` how far the lidar moves during a scan whose points have one pose, turns counted at 10 m.
     ``unit_is_known``: the points are metres, because their format or the user says so."""
 
     reach_m: float | None = field(default=None, kw_only=True)
+    swept_m: float = field(default=0.0, kw_only=True)
     unit_is_known: bool = field(default=True, kw_only=True)
 
     def look_at_first(self, what: str) -> None:
@@ -183,8 +186,22 @@ class LidarRecording(Dataset):
                     "pass --depth-scale 1000 if depth is in millimetres, --depth-scale 1 if it is in metres"
                 )
             self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
+            if isinstance(frame.camera, RayTable) and frame.camera.origins_m is None:
+                self.swept_m = self._swept_m()
             return
         raise DatasetError(f"{self.name}: no {what} can be read: {problem}") from problem
+
+    def _swept_m(self) -> float:
+        """The median motion in the usual time of a scan, by scans' poses; 0 if it is less than noise."""
+        moved_m, stamps = [], self.stamps()
+        for index in [] if self.tracked else range(0, len(self) - 1, max(1, len(self) // _LOOKED_UP)):
+            seconds = stamps[index + 1] - stamps[index]
+            with contextlib.suppress(FrameError):  # told when it is read
+                rotation, translation = tangent_norms(self.pose(index), self.pose(index + 1))
+                share = min(1.0, SECONDS_PER_SCAN / seconds) if seconds > 0 else 0.0
+                moved_m.append(share * (_FAR_M * rotation + translation))
+        swept_m = float(np.median(moved_m)) if moved_m else 0.0
+        return swept_m if swept_m > LIDAR_SIGMA_M else 0.0
 
     @property
     def stated(self) -> StatedSensor:
@@ -194,6 +211,7 @@ class LidarRecording(Dataset):
             origin="assumed for a lidar",
             reach_m=self.reach_m,
             pass_through=LIDAR_PASS_THROUGH,
+            swept_m=self.swept_m,
         )
 
 

@@ -256,6 +256,19 @@ class LidarBag(LidarRecording, Table[BagRow]):
         pattern = isinstance(self.camera, RayTable) and self.camera.has_pattern
         rays = f"images of {self.camera.width} x {self.camera.height} rays" if pattern else "free rays"
         self.notes.append(f"{self.topic}: {rays}")
+        if self.registered:
+            self.swept_m = 0.0
+        elif self.swept_m and self._has_times():
+            self.notes.append(
+                f"{self.topic}: the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at 10 m, "
+                "which is not undone, though its points have times: leave out deskew=false"
+            )
+
+    def _has_times(self) -> bool:
+        """True if points of the first cloud have times that differ."""
+        entry = self.rows[0].entry
+        seconds = decode(self.reader.read(self.topic, entry), entry.stamp).seconds
+        return seconds is not None and bool(np.ptp(seconds[np.isfinite(seconds)]) > 0)
 
 
 def _image(cloud: Cloud, motion: Motion | None) -> Scan | None:

@@ -21,6 +21,7 @@ from taichi_mrf.datasets.ros.stamps import stamped
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, choose_depth
 from taichi_mrf.datasets.timed_poses import largest_gap, within_gap
+from taichi_mrf.datasets.turned import of_image_size, turn_hint
 from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -219,6 +220,15 @@ class BagCameras:
         camera = stated[max(0, bisect_right(begin, entry.stamp) - 1)][1]
         return (camera.of(shape) if shape is not None else None) or camera.cut
 
+    def of_images(self, size: tuple[int, int], turned: str) -> "BagCameras":
+        """The cameras of stored images of this (width, height), which are ``turned``."""
+
+        def of(camera: StatedCamera) -> StatedCamera:
+            return StatedCamera(*(of_image_size(each, size, turned) for each in (camera.full, camera.cut)))
+
+        stated = {frame: [(s, of(each)) for s, each in found] for frame, found in self.by_frame.items()}
+        return replace(self, by_frame=stated, first=of_image_size(self.first, size, turned))
+
     def measured(
         self, message: Any, entry: Entry, depth_scale: float | None, where: str
     ) -> tuple[NDArray[np.float32], PinholeCamera]:
@@ -285,7 +295,7 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
     cameras = BagCameras(
         by_frame, by_frame[entries[0].frame][0][1].cut, lenses[0], _changes(by_frame, entries)
     )
-    return _fitted(reader, depth, name, entries, cameras)
+    return _fitted(reader, depth, name, entries, cameras, options.conventions.turned)
 
 
 def _frame_of_info(
@@ -332,28 +342,32 @@ def _half_a_frame(entries: Sequence[Entry]) -> float:
 
 
 def _fitted(
-    reader: TopicSource, depth: DepthTopic, name: str, entries: Sequence[Entry], cameras: BagCameras
+    reader: TopicSource,
+    depth: DepthTopic,
+    name: str,
+    entries: Sequence[Entry],
+    cameras: BagCameras,
+    turned: str,
 ) -> BagCameras:
-    """The cameras with the first one as it fits its images, and a note if they are of another size than its
-    CameraInfo. Raises DatasetError if none of the first images fits."""
+    """The cameras with the first one as it fits its images, which may be ``turned``, and a note if they
+    have another size than its CameraInfo. Raises DatasetError if none of the first images fits."""
     problem = ""
     for entry in entries[:_LOOKED_AT]:
         try:
             height, width = shape = messages.depth_image(reader.read(depth.name, entry), None).shape
         except DatasetError:
             continue
+        hint = turn_hint(cameras.at(entry), (width, height))
+        cameras = cameras.of_images((width, height), turned)
         stated, camera = cameras.at(entry), cameras.at(entry, shape)
         sizes = f"{width} x {height} pixels, the CameraInfo of {name} {stated.width} x {stated.height}"
         if camera.shape == shape:
             scaled = f"the images of {depth.name} have {sizes}: the camera is fitted to them"
             notes = [scaled] if stated.shape != shape else []
             return replace(cameras, first=camera, notes=cameras.notes + notes)
-        problem = problem or sizes
+        problem = problem or f"{sizes}, which is not the same view; pass --camera fx,fy,cx,cy{hint}"
     if problem:
-        raise DatasetError(
-            f"{reader.path}: the images of {depth.name} have {problem}, which is not the same view; "
-            "pass --camera fx,fy,cx,cy"
-        )
+        raise DatasetError(f"{reader.path}: the images of {depth.name} have {problem}")
     return cameras
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.methods.map_file import (
+    FORMAT,
     MapHeader,
     StoredKeyframe,
     open_map_file,
@@ -158,6 +159,8 @@ def write_contents(path: Path, contents: MapContents) -> None:
         arrays["parked"] = np.array(contents.parked, np.str_)
     if contents.frozen_dated is not None:
         arrays |= dated_arrays(*contents.frozen_dated) | waiting_arrays(contents.waiting)
+    if contents.waiting:
+        arrays["format"] = np.asarray(FORMAT)  # a version that passes over them would lose evidence
     if len(contents.colors) and contents.colors.any():
         arrays["colors"] = contents.colors
     arrays |= color_arrays(contents.frozen_colors) | ray_arrays(contents.kept)
