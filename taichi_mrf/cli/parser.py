@@ -212,7 +212,8 @@ def flags_of(options: type, prefix: str = "", pairs_off: bool = False) -> Iterat
         if dataclasses.is_dataclass(hint):
             yield from flags_of(typing.cast(type, hint), f"{prefix}{name}." if name else prefix, alone)
             continue
-        metavar = given.metavar if given is not None and given.metavar else _metavar(hint)
+        metavar = given.metavar if given is not None and given.metavar else field.metadata.get("metavar")
+        metavar = metavar or _metavar(hint)
         if tyro.conf.Positional in metadata:
             yield Flag(metavar, "", texts.get(field.name, ""), field.default)
             continue

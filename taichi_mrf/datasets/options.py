@@ -7,6 +7,7 @@ from typing import TypeVar, get_type_hints
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import check_field, from_dict
 from taichi_mrf.datasets.conventions import AXIAL, Conventions, conventions_of
+from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -63,6 +64,9 @@ class ReadOptions:
 
     image_is: str | None = None
     """How images are turned (conventions.py), such as ``turned-left``."""
+
+    body: OwnBody = NO_BODY
+    """The robot's own body, whose measurements are left out."""
 
     def __post_init__(self) -> None:
         try:

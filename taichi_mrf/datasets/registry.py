@@ -23,8 +23,10 @@ from taichi_mrf.datasets.derived import mended, pose_of, resampled
 from taichi_mrf.datasets.entries import BUILT_IN, FORMATS, FOXGLOVE
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
 from taichi_mrf.datasets.ros.names import is_bag
 from taichi_mrf.datasets.turned import T_sensor_stored, stored_camera
+from taichi_mrf.datasets.without_body import masked, without_body
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, collected_warnings, naming, said
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
@@ -105,6 +107,7 @@ def open_dataset(
     mounting: tuple[float, ...] | None = None,
     depth_is: str = AXIAL,
     image_is: str | None = None,
+    body: OwnBody = NO_BODY,
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
@@ -113,7 +116,7 @@ def open_dataset(
     """
     options = ReadOptions(
         camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track,
-        poses_are, mounting, depth_is, image_is,
+        poses_are, mounting, depth_is, image_is, body,
     )  # fmt: skip
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
@@ -185,8 +188,10 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     )
     dataset.camera = given
     distortion = dataset.distortion if options.undistort is None else options.undistort
-    picked = resampled(dataset, distortion, options.stride, conventions.turned)
+    seen = masked(dataset, options.body.mask)
+    picked = resampled(seen, distortion, options.stride, conventions.turned)
     picked.tracked = dataset.tracked
+    picked = without_body(picked, options.body, conventions)
     asked = mended(picked, conventions, options.max_time_gap)
     apart = "" if asked.tracked or asked.endless else out_of_sight(asked)
     asked.notes += [f"{apart}; taichi-mrf doctor tells"] if apart else []

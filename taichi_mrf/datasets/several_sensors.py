@@ -29,6 +29,7 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.values import check_field, from_dict
 from taichi_mrf.datasets.base import Dataset, Row, StatedSensor, Table
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.own_body import NO_BODY
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError, naming
@@ -70,7 +71,8 @@ class SensorEntry:
     row."""
 
     reading: SourceFlags = field(default_factory=SourceFlags)
-    """How the source is read: fields of the command line's flags, such as depth_scale and image_scale."""
+    """How the source is read: fields of the command line's flags, such as depth_scale and mask, whose path is
+    relative to the file."""
 
     def __post_init__(self) -> None:
         check_field(self.every >= 1, "every", "must be at least 1")
@@ -198,7 +200,7 @@ def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions
     source = entry.source
     if not Path(source).is_absolute() and not _SOURCE.match(source):
         source = str(path.parent / source)
-    keywords = entry.reading.keywords()
+    keywords = entry.reading.within(path.parent).keywords()
     if keywords["max_time_gap"] is None:
         keywords["max_time_gap"] = options.max_time_gap
     dataset = open_dataset(source, color=options.color, **keywords)
@@ -214,7 +216,7 @@ def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions
 def _refuse(path: Path, options: ReadOptions) -> None:
     """Raise DatasetError for options that each sensor has its own of."""
     own = (options.camera, options.intrinsics, options.depth_scale, options.undistort)
-    if any(value is not None for value in own) or options.image_scale != 1.0:
+    if any(value is not None for value in own) or options.image_scale != 1.0 or options.body != NO_BODY:
         raise DatasetError(f"{path}: lists several sensors; set how each is read there, as reading: {{...}}")
     if options.track:
         raise DatasetError(f"{path}: lists several sensors, whose poses cannot be found by tracking")

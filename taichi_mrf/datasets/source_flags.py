@@ -9,11 +9,12 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 from taichi_mrf.datasets.conventions import conventions_of
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class SourceFlags:
+class SourceFlags(OwnBody):
     """How SOURCE is read; :meth:`keywords` are arguments of ``open_dataset``."""
 
     depth_scale: float | None = None
@@ -50,9 +51,12 @@ class SourceFlags:
         """The flags that differ from the defaults, as they are typed."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = {name: value for name, value in given.items() if value != getattr(SourceFlags, name)}
-        return [f"--{name.replace('_', '-')}={value}" for name, value in changed.items()]
+        boxes = changed.pop("body_box", ())
+        words = [f"--{name.replace('_', '-')}={value}" for name, value in changed.items()]
+        return words + [word for box in boxes for word in ("--body-box", *map(str, box))]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.keywords()
 
     def keywords(self) -> dict[str, Any]:
@@ -67,6 +71,7 @@ class SourceFlags:
             "mounting": _numbers("--mounting", self.mounting, (7,), "x,y,z,qx,qy,qz,qw"),
             "depth_is": self.depth_is,
             "image_is": self.image_is,
+            "body": self.own_body,
         }
         conventions_of(
             keywords["poses_are"], keywords["mounting"], keywords["depth_is"], keywords["image_is"]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AXIAL, conventions_of
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.doctor.diagnosis import Diagnosis, as_stored, diagnose, unexplained
@@ -68,6 +69,8 @@ def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceF
     words = ("poses_are", "mounting", "depth_is", "image_is")
     said = conventions_of(*(keywords[word] for word in words))
     as_written = {**keywords, **dict.fromkeys(words), "depth_is": AXIAL}
+    if said.turned or said.along_ray:  # the sensor's frame, in which boxes are, is not known yet
+        as_written["body"] = OwnBody(mask=reading.mask)
     dataset: Dataset
     try:
         dataset = open_posed(source, poses, color=False, **as_written)

@@ -34,12 +34,14 @@ COMMANDS = {
     "ouster": ("ouster.sdk", ["map", "drive.osf", "--out", "out"]),
     "realsense": ("pyrealsense2", ["map", "realsense:", "--out", "out"]),
     "record3d": ("lzfse", ["map", "walk", "--out", "out"]),
+    "robot": ("yourdfpy", ["map", ROOM, "--robot", "arm.urdf", "--camera-link", "eye", "--out", "out"]),
     "ros": ("rosbags.highlevel", ["map", "drive.bag", "--out", "out"]),
     "store": ("zarr", ["map", ROOM, "--submap-size", "5", "--out", "out"]),
 }
 """Extra -> a module of it, and a command that cannot do without."""
 
-EXPORTS = {"glb": "trimesh", "stl": "trimesh", "obj": "trimesh"}
+MESH = "trimesh", "mesh"
+EXPORTS = {"glb": MESH, "stl": MESH, "obj": MESH, "mcap": ("foxglove", "robot")}
 
 
 @pytest.fixture(autouse=True)
@@ -85,10 +87,10 @@ def test_an_export_says_which_extra_it_needs(
     m.add_keyframe(np.full(camera.shape, 2.0, np.float32), np.eye(4), camera)
     m.infer()
     m.save("map.npz")
-    for suffix, module in EXPORTS.items():
+    for suffix, (module, extra) in EXPORTS.items():
         with monkeypatch.context() as without:
             without.setitem(sys.modules, module, None)
-            refused(["export", "map.npz", "--to", f"wall.{suffix}", "--arch", backend], "mesh", capsys)
+            refused(["export", "map.npz", "--to", f"wall.{suffix}", "--arch", backend], extra, capsys)
         assert not Path(f"wall.{suffix}").exists()
 
 

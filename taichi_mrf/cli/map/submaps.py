@@ -37,7 +37,8 @@ def map_submaps(options: Map, console: Terminal, request: StopRequest) -> int:
     library("zarr", "maps in chunks need", "store")  # fails before the work, not after it
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
-    sequence = SourceFrames(source, options.reading.keywords(), options.every, options.limit)
+    reading = options.reading.within(Path.cwd())
+    sequence = SourceFrames(source, reading.keywords(), options.every, options.limit)
     if not options.resume:  # which takes its parameters from here
         _refuse_to_replace(options)
         (options.out / REPORT_FILE).unlink(missing_ok=True)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.shared import Reading
 from taichi_mrf.config.schema import Arch
 from taichi_mrf.datasets.source_flags import SourceFlags
 
@@ -36,5 +37,5 @@ class Doctor:
     arch: Arch = "auto"
     """Backend that renders a built-in source."""
 
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    reading: Reading = field(default_factory=SourceFlags)
     """How SOURCE is read."""

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.cli.options.config_file import live_defaults
-from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Verbosity, check_least, check_port
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least, check_port
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -65,7 +65,7 @@ class Live:
     open: bool = False
     """Open the page in a browser on this machine."""
 
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    reading: Reading = field(default_factory=SourceFlags)
     """How SOURCE is read."""
 
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)

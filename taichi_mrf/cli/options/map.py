@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Verbosity, check_least
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -84,7 +84,7 @@ class Map:
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""
 
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    reading: Reading = field(default_factory=SourceFlags)
     """How SOURCE is read."""
 
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from taichi_mrf.cli.options.shared import Reading
 from taichi_mrf.config.schema import Arch
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.export.options import ExportOptions
@@ -89,7 +90,7 @@ class Info:
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the facts as JSON instead of tables."""
 
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    reading: Reading = field(default_factory=SourceFlags)
     """How SOURCE is read."""
 
 

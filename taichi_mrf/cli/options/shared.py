@@ -6,7 +6,11 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
+
+Reading = Annotated[SourceFlags, tyro.conf.arg(name=""), tyro.conf.UseAppendAction]
+"""How a command reads its source, as a field of its options."""
 
 
 def check_least(options: object, **least: int) -> None:

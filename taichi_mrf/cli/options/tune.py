@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from taichi_mrf.cli.options.shared import NoiseFlags, Verbosity, check_least, check_port
+from taichi_mrf.cli.options.shared import NoiseFlags, Reading, Verbosity, check_least, check_port
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -76,7 +76,7 @@ class Tune:
     open: bool = False
     """Open the page in a browser on this machine."""
 
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    reading: Reading = field(default_factory=SourceFlags)
     """How SOURCE is read."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)

@@ -1,0 +1,68 @@
+"""What is known of the robot's own body, which its sensor sees: measurements of it are none of the world."""
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+from taichi_mrf.errors import ConfigError
+
+Box = tuple[float, float, float, float, float, float]
+"""x0 y0 z0 x1 y1 z1: two corners in metres, the lower one first."""
+
+_FILE = {"metavar": "FILE"}
+
+AnyBody = TypeVar("AnyBody", bound="OwnBody")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnBody:
+    """Where the robot itself is. What it covers counts as not measured, and never as without a return."""
+
+    mask: str | None = field(default=None, metadata=_FILE)
+    """An image of one channel (PNG), as large as a depth image is stored: 0 is the robot's own body, anything
+    else the world."""
+
+    body_box: tuple[Box, ...] = field(default=(), metadata={"metavar": "X0 Y0 Z0 X1 Y1 Z1"})
+    """A box in the frame of the camera or lidar in metres, in which measurements are of the robot's own body;
+    may be repeated."""
+
+    robot: str | None = field(default=None, metadata=_FILE)
+    """A URDF of the robot. What its geometry covers at the frame's stamp is its own body; what is in front of
+    it stays."""
+
+    camera_link: str | None = field(default=None, metadata={"metavar": "NAME"})
+    """The link of the URDF whose frame is the camera's (x right, y down, z ahead) or lidar's."""
+
+    joints: str | None = field(default=None, metadata=_FILE)
+    """Positions of the URDF's joints, in radians or metres: a YAML file of 'name: value', or a .csv table
+    with the columns stamp and a joint each, between whose rows they are linear. Others are at 0."""
+
+    body_margin: float = 0.02
+    """By how much the URDF's geometry is grown (metres)."""
+
+    def __post_init__(self) -> None:
+        if (self.robot is None) != (self.camera_link is None) or (self.joints and self.robot is None):
+            raise ConfigError("--robot needs --camera-link NAME, and --joints and --camera-link need --robot")
+        if not 0 <= self.body_margin < math.inf:
+            raise ConfigError(f"--body-margin must be a number of metres, not {self.body_margin:g}")
+        for box in self.body_box:
+            if not all(map(math.isfinite, box)) or not all(a < b for a, b in zip(box, box[3:], strict=False)):
+                raise ConfigError(
+                    "--body-box takes X0 Y0 Z0 X1 Y1 Z1 in metres, each of the first three below its fellow "
+                    f"of the last three, not {' '.join(f'{x:g}' for x in box)}"
+                )
+
+    @property
+    def own_body(self) -> "OwnBody":
+        """These fields alone."""
+        return OwnBody(**{each.name: getattr(self, each.name) for each in fields(OwnBody)})
+
+    def within(self: AnyBody, folder: Path) -> AnyBody:
+        """The same, with files that are relative to a folder."""
+        mask, robot, joints = (path and str(folder / path) for path in (self.mask, self.robot, self.joints))
+        return replace(self, mask=mask, robot=robot, joints=joints)
+
+
+NO_BODY = OwnBody()
+"""Nothing is known of it."""
