@@ -9,7 +9,8 @@ the map's origin is in the recorded world, unless that is 0.
 """
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,15 @@ from taichi_mrf.export.map_server import LevelMap, grey_image, level_map, write_
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
-from taichi_mrf.export.robot_messages import MapChannels, write_mcap
+from taichi_mrf.export.robot_messages import (
+    CLOUD,
+    COSTMAP,
+    OCTOMAP,
+    PATH,
+    SURFACE,
+    MapChannels,
+    write_mcap,
+)
 from taichi_mrf.export.robot_messages import require_libraries as require_message_libraries
 from taichi_mrf.export.surface import Surface, photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.poses import Pose
@@ -228,25 +237,63 @@ def _level(decided: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
     return level_map(decided, *band, up)
 
 
+@dataclass(frozen=True)
+class MapToSend:
+    """What messages are made from: a map, the reading of it whose voxels are sent, and ``poses``, those of
+    keyframes by their stamps in seconds."""
+
+    m: VoxelMap
+    by: VoxelMap
+    options: ExportOptions
+    poses: Mapping[float, Pose]
+
+    @property
+    def stamp_s(self) -> float:
+        """When the newest keyframe was taken, 0 without one."""
+        return max(self.poses, default=0.0)
+
+
 def _messages(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
-    """Without a band of heights there is no costmap."""
     keyframes = getattr(m, "keyframes", {}).values()
-    poses = {k.stamp_s: k.T_world_camera for k in keyframes}
-    stamp_s = max(poses, default=0.0)
+    sent = MapToSend(m, m.decided, options, {k.stamp_s: k.T_world_camera for k in keyframes})
 
     def log(channels: MapChannels) -> None:
-        decided, up = m.decided, _up(m, options)
-        channels.octomap(decided, options.cells, stamp_s)
-        if options.z_min is not None or options.z_max is not None:
-            channels.costmap(_level(decided, options, up), up[1] * (options.z_min or 0.0), stamp_s)
-        channels.poses(poses)
-        channels.voxels(*_points(decided, path, options), stamp_s)
-        measured = _with_rays(m, path, options)
-        surface = smooth_surface(m, options.threshold) if measured is None else measured_surface(measured)
-        channels.surface(surface, stamp_s)
+        for stamp_s, T_world_camera in sorted(sent.poses.items(), key=lambda each: each[0]):
+            channels.transform(T_world_camera, stamp_s)
+        for log_message in MESSAGES.values():
+            log_message(channels, sent)
 
     write_mcap(path, log)
     return [path]
+
+
+def _log_costmap(channels: MapChannels, sent: MapToSend) -> None:
+    """Without a band of heights there is no costmap."""
+    options, up = sent.options, _up(sent.m, sent.options)
+    if options.z_min is not None or options.z_max is not None:
+        channels.costmap(_level(sent.by, options, up), up[1] * (options.z_min or 0.0), sent.stamp_s)
+
+
+def _log_path(channels: MapChannels, sent: MapToSend) -> None:
+    if sent.poses:
+        channels.path(sent.poses)
+
+
+def _log_surface(channels: MapChannels, sent: MapToSend) -> None:
+    m, options = sent.m, sent.options
+    measured = _with_rays(m, Path(SURFACE), options)
+    surface = smooth_surface(m, options.threshold) if measured is None else measured_surface(measured)
+    channels.surface(surface, sent.stamp_s)
+
+
+MESSAGES: dict[str, Callable[[MapChannels, MapToSend], None]] = {
+    OCTOMAP: lambda to, sent: to.octomap(sent.by, sent.options.cells, sent.stamp_s),
+    COSTMAP: _log_costmap,
+    PATH: _log_path,
+    CLOUD: lambda to, sent: to.voxels(*_points(sent.by, Path(CLOUD), sent.options), sent.stamp_s),
+    SURFACE: _log_surface,
+}
+"""The messages of a map by their topics, for files and servers; beside them are transforms of keyframes."""
 
 
 def _arrays(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:

@@ -25,10 +25,13 @@ from taichi_mrf.system.libraries import library
 WORLD, CAMERA = "map", "camera"
 """Frames of all messages."""
 
+CLOUD, SURFACE, PATH, TRANSFORMS = "/map/voxels", "/map/surface", "/map/path", "/tf"
+COSTMAP, OCTOMAP = "/map/costmap", "/map/octomap"
+
 OCCUPIED_CELL, FREE_CELL, UNKNOWN_CELL = 100, 0, -1
 """Cells of a nav_msgs/OccupancyGrid."""
 
-OCTOMAP = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"
+OCTOMAP_TEXT = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"
 """The definition of octomap_msgs/msg/Octomap, which rosbags does not know."""
 
 _OCTOMAP_TYPE, _GRID_TYPE = "octomap_msgs/msg/Octomap", "nav_msgs/msg/OccupancyGrid"
@@ -49,32 +52,36 @@ class MapChannels:
         self._messages = library("foxglove.messages", "messages for robots need", "robot")
         typed = library("foxglove.channels", "messages for robots need", "robot")
         self._context = context
-        self._voxels = typed.PointCloudChannel("/map/voxels", context=context)
-        self._surface = typed.SceneUpdateChannel("/map/surface", context=context)
-        self._path = typed.PosesInFrameChannel("/map/path", context=context)
-        self._transforms = typed.FrameTransformsChannel("/tf", context=context)
+        self._voxels = typed.PointCloudChannel(CLOUD, context=context)
+        self._surface = typed.SceneUpdateChannel(SURFACE, context=context)
+        self._path = typed.PosesInFrameChannel(PATH, context=context)
+        self._transforms = typed.FrameTransformsChannel(TRANSFORMS, context=context)
         self._ros = _RosChannels(self._foxglove, context)
+        typed_ones = self._voxels, self._surface, self._path, self._transforms
+        self._all = {each.topic(): each for each in (*typed_ones, *self._ros.channels)}
 
-    def poses(self, T_world_camera: Mapping[float, Pose]) -> None:
-        """Log the poses (4, 4) of keyframes by their stamps in seconds: one by one as the frame CAMERA, and
-        all of them as a path."""
-        poses = []
-        for stamp_s, T in sorted(T_world_camera.items(), key=lambda each: each[0]):
-            x, y, z, w = quaternion(T[:3, :3]).tolist()
-            place = self._messages.Vector3(**dict(zip("xyz", T[:3, 3].tolist(), strict=True)))
-            turn = self._messages.Quaternion(x=x, y=y, z=z, w=w)
-            poses.append(self._messages.Pose(position=place, orientation=turn))
-            transform = self._messages.FrameTransform(
-                timestamp=self._time(stamp_s), parent_frame_id=WORLD, child_frame_id=CAMERA,
-                translation=place, rotation=turn,
-            )  # fmt: skip
-            self._transforms.log(
-                self._messages.FrameTransforms(transforms=[transform]), log_time=nanoseconds(stamp_s)
-            )
-        if poses:
-            newest_s = max(T_world_camera)
-            path = self._messages.PosesInFrame(timestamp=self._time(newest_s), frame_id=WORLD, poses=poses)
-            self._path.log(path, log_time=nanoseconds(newest_s))
+    def are_wanted(self, topic: str) -> bool:
+        """True if a file is written, or somebody has subscribed to the topic."""
+        return bool(self._all[topic].has_sinks())
+
+    def transform(self, T_world_camera: Pose, stamp_s: float) -> None:
+        """Log the pose (4, 4) of a keyframe as that of the frame CAMERA."""
+        place, turn = self._placed(T_world_camera)
+        transform = self._messages.FrameTransform(
+            timestamp=self._time(stamp_s), parent_frame_id=WORLD, child_frame_id=CAMERA,
+            translation=place, rotation=turn,
+        )  # fmt: skip
+        message = self._messages.FrameTransforms(transforms=[transform])
+        self._transforms.log(message, log_time=nanoseconds(stamp_s))
+
+    def path(self, T_world_camera: Mapping[float, Pose]) -> None:
+        """Log the poses (4, 4) of keyframes by their stamps in seconds as a path."""
+        newest_s = max(T_world_camera)
+        in_time = [T for _, T in sorted(T_world_camera.items(), key=lambda each: each[0])]
+        placed = [self._placed(T) for T in in_time]
+        poses = [self._messages.Pose(position=place, orientation=turn) for place, turn in placed]
+        path = self._messages.PosesInFrame(timestamp=self._time(newest_s), frame_id=WORLD, poses=poses)
+        self._path.log(path, log_time=nanoseconds(newest_s))
 
     def voxels(
         self,
@@ -136,6 +143,12 @@ class MapChannels:
         """Log which voxels are free and which occupied as a binary octomap_msgs/Octomap."""
         self._ros.octomap(binary_octree(decided, cells)[0], decided.voxel_size, stamp_s)
 
+    def _placed(self, T: Pose) -> tuple[Any, Any]:
+        """A pose as a Vector3 and a Quaternion."""
+        place = self._messages.Vector3(**dict(zip("xyz", T[:3, 3].tolist(), strict=True)))
+        turn = self._messages.Quaternion(**dict(zip("xyzw", quaternion(T[:3, :3]).tolist(), strict=True)))
+        return place, turn
+
     def _time(self, stamp_s: float) -> Any:
         return self._messages.Timestamp(*divmod(nanoseconds(stamp_s), 1_000_000_000))
 
@@ -146,13 +159,15 @@ class _RosChannels:
     def __init__(self, foxglove: Any, context: Any) -> None:
         typesys = library("rosbags.typesys", "messages of ROS need", "robot")
         self._store = typesys.get_typestore(typesys.Stores.LATEST)
-        self._store.register(typesys.get_types_from_msg(OCTOMAP, _OCTOMAP_TYPE))
-        self._log: dict[str, Callable[..., None]] = {}
-        for topic, name in (("/map/costmap", _GRID_TYPE), ("/map/octomap", _OCTOMAP_TYPE)):
+        self._store.register(typesys.get_types_from_msg(OCTOMAP_TEXT, _OCTOMAP_TYPE))
+        self._by_type: dict[str, Any] = {}
+        for topic, name in ((COSTMAP, _GRID_TYPE), (OCTOMAP, _OCTOMAP_TYPE)):
             definition = self._store.generate_msgdef(name, ros_version=2)[0]
             schema = foxglove.Schema(name=name, encoding="ros2msg", data=definition.encode())
-            channel = foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
-            self._log[name] = channel.log
+            self._by_type[name] = foxglove.Channel(
+                topic, schema=schema, message_encoding="cdr", context=context
+            )
+        self.channels = tuple(self._by_type.values())
 
     def costmap(self, cells: NDArray[np.int8], cell_size: float, T_world_plan: Pose, stamp_s: float) -> None:
         types = self._store.types
@@ -178,7 +193,7 @@ class _RosChannels:
     def _write(self, name: str, stamp_s: float, **fields: Any) -> None:
         message = self._store.types[name](**fields)
         content = bytes(self._store.serialize_cdr(message, name))
-        self._log[name](content, log_time=nanoseconds(stamp_s))
+        self._by_type[name].log(content, log_time=nanoseconds(stamp_s))
 
 
 def write_mcap(path: Path, log: Callable[[MapChannels], None]) -> None:
