@@ -42,6 +42,7 @@ def run_live(options: Live) -> int:
                     f"{options.out}: holds a run: choose another --out, or add --overwrite to replace it"
                 )
         request = stack.enter_context(stop_on_signals(print_line, keeps=options.out is not None))
+        server = options.publishing.serve(stack, print_line)
 
         # The page: it starts in a process of its own while this one loads what maps.
         bar = ProgressBar(console, options.printing)
@@ -86,7 +87,7 @@ def run_live(options: Live) -> int:
 
         # The map, and the loop: requests of the page, frames that are due, inference, what has changed.
         policy = Policy(options.out, options.exit_when_done, options.keep_live)
-        session = Session(source, page.link, policy, page.listening)
+        session = Session(source, page.link, policy, page.listening, server)
         with bar:
             session.run(request)
             while page.starts_again(request):

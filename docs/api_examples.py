@@ -103,6 +103,11 @@ with tm.live(wall) as page:  # http://127.0.0.1:8080
     wall.renew([wall.add(seen)])
     page.update()
 
+# tm.publish
+with tm.publish(wall, port=0) as served:  # ws://127.0.0.1:8765 unless told
+    wall.renew([wall.add_keyframe(wall_m, np.eye(4), camera)])
+    served.update()
+
 # tm.show
 tm.show(m, browser=False)  # until Ctrl-C; in a notebook, below the cell
 

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from taichi_mrf.sensor.own_evidence import sigma_of_confidence as sigma_of_confidence
     from taichi_mrf.sensor.ray_table import RayTable as RayTable
     from taichi_mrf.sensor.spherical import SphericalCamera as SphericalCamera
+    from taichi_mrf.session.message_server import publish as publish
     from taichi_mrf.session.own_loop import live as live
     from taichi_mrf.session.own_loop import show as show
     from taichi_mrf.system.runtime import init as init
@@ -82,6 +83,7 @@ _PUBLIC = {
     "open_dataset": "taichi_mrf.datasets",
     "live": "taichi_mrf.session.own_loop",
     "show": "taichi_mrf.session.own_loop",
+    "publish": "taichi_mrf.session.message_server",
     "Config": "taichi_mrf.config.schema",
     "TaichiMRFError": "taichi_mrf.errors",
 }

@@ -1,13 +1,15 @@
-"""Extras that the page shows beside the map: images of a view, the measured surface, what is occupied,
-colours that cameras saw, and the same keyframes mapped by OctoMap's method."""
+"""Extras beside the map: on the page images of a view, the measured surface, what is occupied, colours that
+cameras saw, and the same keyframes mapped by OctoMap's method; elsewhere the map's messages."""
 
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
 
 from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
+from taichi_mrf.session.message_server import MessageServer
 from taichi_mrf.session.pictures import view_images
 from taichi_mrf.session.run import Run
+from taichi_mrf.session.session_core import WAIT_SECONDS
 from taichi_mrf.session.shown_extras import BaselineOverlay, ChangeList, ShownColors, ShownSurface
 from taichi_mrf.viewer.messages import Notice, Update, Watch
 
@@ -27,8 +29,8 @@ work goes on."""
 class Extras:
     """Keeps the extras up to date while there is no other work."""
 
-    def __init__(self, run: Run) -> None:
-        self._run = run
+    def __init__(self, run: Run, server: MessageServer | None = None) -> None:
+        self._run, self._server = run, server
         self._watch = NOTHING
         self._baseline: BaselineOverlay | None = None
         self._changes: ChangeList | None = None
@@ -59,9 +61,12 @@ class Extras:
         """Start over with a new map; the page shows the same extras."""
         self._baseline, self._changes, self._colors, self._surface = None, None, None, None
         self._shown_version, self._points_of = -1, None
+        if self._server is not None:
+            self._server.start_over()
 
     def work(self, go_on: GoOn) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``go_on`` can stop it."""
+        served = self._send_message()
         publisher = self._run.mapper.shown.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
@@ -77,7 +82,7 @@ class Extras:
             if self._baseline is not None:
                 self._run.send(self._baseline.everything_gone())
                 self._baseline = None
-            return False
+            return served
         try:
             return self._catch_up(go_on)
         except Exception as error:  # mapping continues without the baseline
@@ -174,6 +179,28 @@ class Extras:
             shown.give_up_deciding()
             run.publish()
         return True
+
+    def _send_message(self) -> bool:
+        """Send a message to those who subscribe if one is due; a run that ends by itself waits for it.
+        Returns whether there was anything to do."""
+        run, server = self._run, self._server
+        at_rest = self._is_at_rest
+        if server is None or (at_rest and run.mapper.shown.lacks_decisions):
+            return False
+        m, entries = run.mapper.map, run.mapper.roster.entries.values()
+        poses = {each.stamp_s: each.T_world_camera for each in entries if each.state != "off"}
+        sent = False
+
+        def send() -> None:
+            nonlocal sent
+            sent = server.send(m, at_rest, poses)
+
+        if not run.guarded(send):
+            return True
+        wait_s = server.due_in(m, at_rest) if at_rest and run.policy.leave_when_done and not sent else None
+        if wait_s is not None:
+            run.link.wait(min(wait_s, WAIT_SECONDS))
+        return sent or wait_s is not None
 
     @property
     def _is_at_rest(self) -> bool:

@@ -1,4 +1,4 @@
-"""Serves a map's messages while it is made (export.robot_messages): to Foxglove and to robots, those that have
+"""Serves a map's messages (export.robot_messages) to Foxglove and to robots while it is made: those that have
 changed, to those who have subscribed.
 
 What maps asks between two frames whether a message is due. A message costs nothing while nobody has
@@ -68,9 +68,13 @@ class MessageServer:
         self._channels = MapChannels(context)
         try:
             self._server = foxglove.start_server(
-                name="taichi-mrf", context=context, host=host, port=port, server_listener=_Listener(self._came)
+                name="taichi-mrf",
+                context=context,
+                host=host,
+                port=port,
+                server_listener=_Listener(self._came),
             )
-        except (RuntimeError, ValueError) as error:
+        except (OverflowError, RuntimeError, ValueError) as error:
             raise ConfigError(
                 f"no messages can be served at {host}:{port} ({said(error)}): name another port or host"
             ) from error
@@ -171,9 +175,9 @@ def publish(m: OccupancyMap, options: ExportOptions | None = None, **where: Any)
     """Serve a map to Foxglove and to robots while the caller's own loop makes it.
 
     ``options`` are those of :func:`export_map`; a band of heights, ``ExportOptions(z_min=0.1, z_max=1.5)``,
-    adds a costmap. ``where``: ``port`` (8765, 0 for any), ``host`` (127.0.0.1), ``every_s``, the shortest time
-    between two messages of a topic (1 s). Raises ArgumentTypeError if ``m`` takes no keyframes, ConfigError
-    if the port is taken, and TaichiMRFError without the extra ``robot``. Example::
+    adds a costmap. ``where``: ``port`` (8765, 0 for any), ``host`` (127.0.0.1), ``every_s``, the shortest
+    time between two messages of a topic (1 s). Raises ArgumentTypeError if ``m`` takes no keyframes,
+    ConfigError if the port is taken, and TaichiMRFError without the extra ``robot``. Example::
 
         with tm.publish(m, port=8765) as served:
             for depth_m, T_world_camera in camera:

@@ -10,7 +10,7 @@ One thread does all of it, one piece of work after the other, because Taichi may
     else sweep more keyframes whose cavity has changed, if any are left
     else rounds of alignment                   once the sequence has ended, if poses are to be refined
     else full inference, if the map needs it   requests are answered from the map as it was before
-    else the images of a view and the baseline, if they are shown
+    else the images of a view and the baseline, if they are shown, and messages to those who subscribe
     else wait
 """
 
@@ -31,6 +31,7 @@ from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.extras import Extras
 from taichi_mrf.session.link import Link
 from taichi_mrf.session.mapper import LiveKeyframe
+from taichi_mrf.session.message_server import MessageServer
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.requests import Requests, resumes_replay
 from taichi_mrf.session.run import Run, sweeping
@@ -57,11 +58,12 @@ class Session:
         link: Link,
         policy: Policy,
         listening: Callable[[Listening], None] = lambda where: None,
+        server: MessageServer | None = None,
     ) -> None:
-        """Makes the map and sends it to the viewer. ``listening`` is called with the address of the page.
-        Raises TaichiMRFError."""
+        """Makes the map and sends it to the viewer. ``listening`` is called with the address of the page,
+        ``server`` serves the map to others. Raises TaichiMRFError."""
         self.state = Run(source, link, policy)
-        self._extras = Extras(self.state)
+        self._extras = Extras(self.state, server)
         self._requests = Requests(self.state, self._extras, listening, self._begin_anew)
         self._asked = float("-inf")
 

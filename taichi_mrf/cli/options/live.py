@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.cli.options.config_file import live_defaults
+from taichi_mrf.cli.options.publish import PublishFlags
 from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least, check_port
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -73,6 +74,9 @@ class Live:
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
     """Source of sigma."""
+
+    publishing: Annotated[PublishFlags, tyro.conf.arg(name="")] = field(default_factory=PublishFlags)
+    """Where the map is served to others."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
