@@ -287,10 +287,10 @@ def _log_surface(channels: MapChannels, sent: MapToSend) -> None:
 
 
 MESSAGES: dict[str, Callable[[MapChannels, MapToSend], None]] = {
+    CLOUD: lambda to, sent: to.voxels(*_points(sent.by, Path(CLOUD), sent.options), sent.stamp_s),
     OCTOMAP: lambda to, sent: to.octomap(sent.by, sent.options.cells, sent.stamp_s),
     COSTMAP: _log_costmap,
     PATH: _log_path,
-    CLOUD: lambda to, sent: to.voxels(*_points(sent.by, Path(CLOUD), sent.options), sent.stamp_s),
     SURFACE: _log_surface,
 }
 """The messages of a map by their topics, for files and servers; beside them are transforms of keyframes."""

@@ -39,10 +39,9 @@ TOPICS = (TRANSFORMS, *MESSAGES)
 
 @dataclass
 class _Sent:
-    """The last message of a topic: when it was begun, how long it took, and the map that it was made of."""
+    """The last message of a topic: when it was begun, and the map that it was made of."""
 
     begun_s: float = -math.inf
-    took_s: float = 0.0
     state: Hashable = None
 
 
@@ -64,6 +63,7 @@ class MessageServer:
         foxglove = library("foxglove", "messages for robots need", "robot")
         self._options, self._every_s = options or ExportOptions(), every_s
         self._sent = {topic: _Sent() for topic in TOPICS}
+        self._ended_s, self._took_s = -math.inf, 0.0  # the last message of all
         context = foxglove.Context()
         self._channels = MapChannels(context)
         try:
@@ -78,7 +78,7 @@ class MessageServer:
             raise ConfigError(
                 f"no messages can be served at {host}:{port} ({said(error)}): name another port or host"
             ) from error
-        self.address = f"ws://{host}:{self._server.port}"
+        self.address = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
 
     def due_in(self, m: OccupancyMap, at_rest: bool) -> float | None:
         """Seconds until a message is due, 0 if one is; None if nobody waits for any."""
@@ -92,10 +92,17 @@ class MessageServer:
         due = [(self._sent[topic].begun_s, topic) for wait, topic in self._waits(m, at_rest) if wait <= 0]
         if not due:
             return False
-        _, topic = min(due)
-        before, begun_s = self._sent[topic], time.monotonic()
+        topic, begun_s = min(due, key=lambda each: each[0])[1], time.monotonic()
         # Noted first: who subscribes meanwhile is sent another one.
-        self._sent[topic] = now = _Sent(begun_s, before.took_s, _state(m, at_rest))
+        self._sent[topic] = _Sent(begun_s, _state(m, at_rest))
+        try:
+            self._log(topic, m, at_rest, poses)
+        finally:
+            self._ended_s = time.monotonic()
+            self._took_s = self._ended_s - begun_s
+        return True
+
+    def _log(self, topic: str, m: OccupancyMap, at_rest: bool, poses: Mapping[float, Pose]) -> None:
         if topic == TRANSFORMS:
             newest_s = max(poses, default=None)
             if newest_s is not None:
@@ -103,8 +110,6 @@ class MessageServer:
         else:
             by = m.decided if at_rest else m.marginals
             MESSAGES[topic](self._channels, MapToSend(m, by, self._options, poses))
-        now.took_s = time.monotonic() - begun_s
-        return True
 
     def start_over(self) -> None:
         """Send everything again: the map is another one."""
@@ -114,8 +119,7 @@ class MessageServer:
     def close(self) -> None:
         """End, once those who have subscribed have had time to receive the last messages."""
         if any(map(self._channels.are_wanted, TOPICS)):
-            newest_s = max(sent.begun_s + sent.took_s for sent in self._sent.values())
-            time.sleep(max(0.0, newest_s + LINGER_S - time.monotonic()))
+            time.sleep(max(0.0, self._ended_s + LINGER_S - time.monotonic()))
         self._server.stop()
 
     def _waits(self, m: OccupancyMap, at_rest: bool) -> list[tuple[float, str]]:
@@ -123,11 +127,11 @@ class MessageServer:
         if not len(m.view.pool.in_use):
             return []
         state, now_s, found = _state(m, at_rest), time.monotonic(), []
+        free_s = self._ended_s + (0.0 if at_rest else self._took_s * (1 / SHARE - 1))
         for topic, sent in self._sent.items():
             owed = sent.state != state and (at_rest or topic != SURFACE)
             if owed and self._channels.are_wanted(topic):
-                apart_s = max(self._every_s, 0.0 if at_rest else len(TOPICS) * sent.took_s / SHARE)
-                found.append((max(0.0, sent.begun_s + apart_s - now_s), topic))
+                found.append((max(0.0, free_s - now_s, sent.begun_s + self._every_s - now_s), topic))
         return found
 
     def _came(self, topic: str) -> None:
