@@ -36,7 +36,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "view_gain",
         "compare_maps",
     ),
-    "The page": ("live", "show"),
+    "While it is made": ("live", "publish", "show"),
     "Files": ("open_dataset", "load_map", "ChunkedMap", "take_part", "export_map", "ExportOptions"),
     "Evaluation": ("accuracy",),
     "Configuration": ("Config",),
