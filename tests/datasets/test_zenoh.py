@@ -113,7 +113,7 @@ def heard(client: ZenohClient, count: int) -> list[Raw]:
     return found
 
 
-@pytest.fixture(params=["router", "peer"])
+@pytest.fixture(params=["node", "router", "peer"])
 def walk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Robot]:
     with robot(write_bag(tmp_path, plain, kind="mcap"), mode=request.param) as found:
         yield found

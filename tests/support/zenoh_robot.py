@@ -51,7 +51,8 @@ def attached(number: int, time_ns: int) -> bytes:
 @dataclass
 class Robot:
     """``messages`` are (topic, time of recording in nanoseconds, bytes) in order. Who publishes on a topic of
-    ``transient`` keeps its last message. ``mode`` is router or peer."""
+    ``transient`` keeps its last message. ``mode`` is router or peer, or node: a peer behind a router of its
+    own, as rmw_zenoh's are."""
 
     bag: Path
     port: int
@@ -91,14 +92,14 @@ class Robot:
 
     def start(self) -> None:
         """Open the session, at the same port as before."""
-        self.session = zenoh.open(
-            config(
-                mode=self.mode,
-                listen__endpoints=[f"tcp/127.0.0.1:{self.port}"],
-                scouting__multicast__enabled=self.scouting,
-                timestamping__enabled=True,
-            )
-        )
+        own: dict[str, Any] = {"mode": self.mode, "listen__endpoints": [f"tcp/127.0.0.1:{self.port}"]}
+        off: dict[str, Any] = {"scouting__multicast__enabled": self.scouting}
+        self.router = None
+        if self.mode == "node":
+            self.router = zenoh.open(config(**own | off | {"mode": "router"}))
+            own = {"mode": "peer", "listen__endpoints": ["tcp/localhost:0"]}
+            own["connect__endpoints"] = [f"tcp/127.0.0.1:{self.port}"]
+        self.session = zenoh.open(config(**own, **off, timestamping__enabled=True))
         self.publishers: dict[str, Any] = {}
         self.listeners: set[str] = set()
         self.numbers = dict.fromkeys(self.types, 0)
@@ -131,6 +132,8 @@ class Robot:
 
     def stop(self) -> None:
         self.session.close()
+        if self.router is not None:
+            self.router.close()
 
     def listened(self) -> set[str]:
         """The topics that somebody listens to."""
