@@ -11,6 +11,7 @@ from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, 
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, out_of_sight
 from taichi_mrf.datasets.derived import Derived, Mended, Resampled
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
+from taichi_mrf.doctor.carried import carried_along
 from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
 from taichi_mrf.doctor.views import Sample, read_sample
@@ -109,17 +110,18 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     if len(off) >= FEWEST_PAIRS and _same_poses(sample) and off.mean() > _CONTRADICTING:
         text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
+    carried = _carried(search, best)
     if best == given and before > _CONTRADICTING:
-        apart = out_of_sight(dataset)
+        apart = [Finding(text) for text in (out_of_sight(dataset),) if text]
         through = search.seen_through(given) > SEEN_THROUGH
-        return Diagnosis((Finding(apart),) if apart else (), (_NO_READING,), given, contradicted=through)
+        return Diagnosis((*carried, *apart), (_NO_READING,), given, contradicted=through)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
     if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
         through = search.seen_through(given) > SEEN_THROUGH
         return Diagnosis((), (_NO_READING,), given, contradicted=through)
     best = _with_likeliest_units(best, given, steps, sample)
-    found = tuple(_findings(given, best, steps, source))
+    found = (*_findings(given, best, steps, source), *carried)
     return Diagnosis(found, undecided, best, before, search.score(best), search)
 
 
@@ -152,6 +154,18 @@ def as_stored(dataset: Dataset) -> Dataset:
         return replace(dataset, source=as_stored(dataset.source))
     inner = dataset.source if isinstance(dataset, Mended) else dataset
     return inner.source if isinstance(inner, Resampled) and inner.turned and not inner.distorted else inner
+
+
+def _carried(search: Search, reading: Reading) -> list[Finding]:
+    body = carried_along(search, reading)
+    if body is None:
+        return []
+    v, u = np.nonzero(body)
+    text = (
+        f"{body.mean():.1%} of the image, in columns {u.min()} to {u.max()} and rows {v.min()} to {v.max()}, "
+        "moves with the camera, as a robot's own body does: --mask FILE or --robot arm.urdf leaves it out"
+    )
+    return [Finding(text)]
 
 
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:

@@ -28,6 +28,9 @@ SEEN_THROUGH = 0.15
 """Share of the points seen again that lie in front of what is measured there, of the middle one of all
 pairs, up to which frames need not contradict each other: clean recordings have .05 at most."""
 
+NEARER = 0.95
+"""A point at less than this share of the depth that is measured there is looked through."""
+
 QUESTIONS = {
     "inverse": "the direction of poses",
     "w_first": "the order of quaternions",
@@ -50,7 +53,7 @@ _WORST = 0.2
 _EXPLAINING = 0.5
 _NOISE = 0.002
 _BETTER, _AS_WELL = 2.0, 1.3
-_SEEN_AGAIN, _NEARER = 0.3, 0.95
+_SEEN_AGAIN = 0.3
 _ROUNDS = 3
 _FEW, _MANY = 2, 8
 _LATE_STEPS_S = (0.05, 0.01)
@@ -163,7 +166,7 @@ class Search:
                 seen = seen_by(self.sample.views[other], points[one], move, reading)
                 there = seen.measured > 0
                 if there.mean() > _SEEN_AGAIN:
-                    shares.append(float((seen.expected[there] < _NEARER * seen.measured[there]).mean()))
+                    shares.append(float((seen.expected[there] < NEARER * seen.measured[there]).mean()))
         return float(np.median(shares)) if len(shares) >= FEWEST_PAIRS else 0.0
 
     def clearly_better(self, one: Reading, other: Reading) -> bool:
