@@ -20,7 +20,7 @@ from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Arch, Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.entries import FOXGLOVE
+from taichi_mrf.datasets.entries import ROBOTS
 from taichi_mrf.datasets.recorded_noise import proposed_voxel_size
 from taichi_mrf.datasets.registry import format_name, is_rendered, topics_in
 from taichi_mrf.datasets.ros.bag import BagSummary
@@ -148,7 +148,7 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
             raise
         console.print_line(f"It cannot be mapped like this: {error}")
         for name in bag.sources:
-            console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(FOXGLOVE)))
+            console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(ROBOTS)))
         return False
     usable = _print_frames(console, format_name(source), dataset)
     if usable:

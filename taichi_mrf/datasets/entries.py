@@ -18,7 +18,7 @@ from taichi_mrf.system.files import is_file, is_folder
 
 HERE = "taichi_mrf.datasets"
 REALSENSE = "realsense:"
-FOXGLOVE = "foxglove:"
+FOXGLOVE, ZENOH = ROBOTS = "foxglove:", "zenoh:"
 NUMBERED_IMAGE = re.compile(
     r"(depth[-_]?|(?:frame|image|img)[-_]?)?(\d+)(-\d+)?\.(?:png|tiff?)", re.IGNORECASE
 )
@@ -202,5 +202,6 @@ BUILT_IN: dict[str, BuiltIn] = {
         BuiltIn("mesh:", reader("synthetic.mesh_scene:open_mesh")),
         BuiltIn(REALSENSE, reader("realsense.device:open_realsense")),
         BuiltIn(FOXGLOVE, reader("wires.robot:open_foxglove")),
+        BuiltIn(ZENOH, reader("wires.robot:open_zenoh")),
     )
 }

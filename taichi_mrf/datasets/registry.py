@@ -20,7 +20,7 @@ from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.depth_scale import out_of_sight
 from taichi_mrf.datasets.derived import mended, pose_of, resampled
-from taichi_mrf.datasets.entries import BUILT_IN, FORMATS, FOXGLOVE
+from taichi_mrf.datasets.entries import BUILT_IN, FORMATS, ROBOTS
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
@@ -164,9 +164,8 @@ def is_rendered(source: str) -> bool:
 def topics_in(source: str) -> "BagSummary | None":
     """The topics of a bag, or of a robot that runs, which is listened to for some seconds; None for other
     sources. Raises DatasetError."""
-    if source.startswith(FOXGLOVE):
-        address = source.removeprefix(FOXGLOVE).partition("?")[0]
-        return resolve_name("taichi_mrf.datasets.wires.robot:summarise")(address)
+    if source.startswith(ROBOTS):
+        return resolve_name("taichi_mrf.datasets.wires.robot:summarise")(source)
     path, _ = _path_and_query(source)
     return resolve_name("taichi_mrf.datasets.ros.bag:summarise")(path) if is_bag(path) else None
 

@@ -37,8 +37,12 @@ ALONE, ALONE_WITHIN = 3, 3
 THIN_M = 0.07
 """Thickness up to which a thing is thin."""
 
+AROUND_M = 0.16
+"""There is nothing else so far around it. What fringes the edge of a larger thing looks like a rod itself."""
+
 FEWEST = 4
-"""Voxels of a layer that a thing may fill at least: the thinnest one lies in four where it meets an edge."""
+"""Voxels of a layer that a thing may fill at least: the thinnest one lies in four where it meets an edge. A
+thicker one is round, and may fill as many as a circle with a voxel more across."""
 
 FOLLOWED, FEW_BESIDE = 2, 3
 """Voxels that a thin thing is followed for, and how many occupied ones such a voxel may touch."""
@@ -82,7 +86,8 @@ def thin(voxel_size: float) -> tuple[int, int]:
     """The voxels around one, along two axes, in which a layer is looked at, and how many of them a thin thing
     fills at most. A brick and the 26 around it hold all that is looked at."""
     across = THIN_M / voxel_size
-    return min(math.ceil(across) + 2, BRICK), max(FEWEST, int((across + 1) ** 2))
+    reach = max(math.ceil(across) + 2, math.ceil(AROUND_M / voxel_size - 1e-9))
+    return min(reach, BRICK), max(FEWEST, math.ceil(0.25 * math.pi * (across + 1) ** 2))
 
 
 @dataclass(frozen=True)

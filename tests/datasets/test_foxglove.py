@@ -10,8 +10,10 @@ from threading import Thread
 import pytest
 from inputs_bags import INFO, TOPIC, plain, write_bag
 
+from taichi_mrf.datasets.wires import client as clients
 from taichi_mrf.datasets.wires import foxglove
-from taichi_mrf.datasets.wires.foxglove import FoxgloveClient, Raw, wait_until
+from taichi_mrf.datasets.wires.client import Raw, wait_until
+from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
 from taichi_mrf.errors import DatasetError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
@@ -70,7 +72,7 @@ def test_only_wanted_topics_are_sent(walk: Robot, client: FoxgloveClient) -> Non
 def test_the_oldest_images_are_dropped_and_nothing_else(
     walk: Robot, client: FoxgloveClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(foxglove, "MOST_IMAGES", 2)
+    monkeypatch.setattr(clients, "MOST_IMAGES", 2)
     client.subscribe(list(client.channels))
     walk.wait_for(*client.channels)
     walk.send()

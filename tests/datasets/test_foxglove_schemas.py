@@ -12,7 +12,7 @@ from inputs_bags import COUNT, FRAME, TOPIC, Bag, images, mounted, moving_tf, st
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.wires import protobuf
 from taichi_mrf.datasets.wires import robot as wired
-from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import DatasetError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")

@@ -40,7 +40,7 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires import stream
-from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera

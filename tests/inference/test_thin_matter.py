@@ -275,7 +275,7 @@ def test_what_scores_decide_is_what_numpy_finds(voxel_size: float) -> None:
     values.from_numpy(log_odds[places])
     call_matter(votes, values, bricks, np.arange(27, dtype=np.int32), voxel_size, prior, least)
 
-    reach, most = {0.2: (3, 4), 0.05: (4, 5), 0.02: (6, 20)}[voxel_size]
+    reach, most = {0.2: (3, 4), 0.05: (4, 5), 0.02: (8, 16)}[voxel_size]
     wanted = verdicts_by_numpy(occupied, score, reach, most)[places]
     decided, was = values.to_numpy(), log_odds[places]
     assert {0, 1, 2} == set(wanted.tolist())

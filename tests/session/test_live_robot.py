@@ -19,7 +19,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.wires import foxglove, stream
 from taichi_mrf.datasets.wires import robot as wired
-from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy

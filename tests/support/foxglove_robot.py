@@ -12,7 +12,7 @@ import foxglove
 from foxglove import messages as m
 from rosbags.highlevel import AnyReader
 
-from taichi_mrf.datasets.wires.foxglove import wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 
 
 @dataclass

@@ -25,8 +25,8 @@ class Live:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
     """A folder, whose format is recognised, a built-in sequence, a camera (realsense:), a robot that runs
-    (foxglove:ws://robot:8765), or a saved map (map.npz). Of a folder that holds several recordings or maps,
-    the page offers all; the first is taken."""
+    (foxglove:ws://robot:8765, or zenoh:tcp/robot:7447 of rmw_zenoh), or a saved map (map.npz). Of a folder
+    that holds several recordings or maps, the page offers all; the first is taken."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder for the results, created if needed: map.npz, voxels.ply, config.yaml, report.json,

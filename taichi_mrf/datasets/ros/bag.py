@@ -349,4 +349,5 @@ def _pose_options(reader: TopicSource, tree: TransformTree, frame: str) -> list[
 def _sources(reader: TopicSource, tree: TransformTree, frame: str, chosen: list[str]) -> list[str]:
     """The source's name with the options that have to be ``chosen`` for a topic, for each source of poses."""
     found = [[*chosen, *pose] for pose in _pose_options(reader, tree, frame)]
-    return [f"{reader.path}?{'&'.join(options)}" if options else str(reader.path) for options in found]
+    mark = "&" if isinstance(reader.path, str) and "?" in reader.path else "?"  # a robot's domain
+    return [f"{reader.path}{mark}{'&'.join(options)}" if options else str(reader.path) for options in found]

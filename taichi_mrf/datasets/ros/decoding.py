@@ -59,6 +59,8 @@ class Decoder:
         """The types of a channel's messages, by its definition or those that are known."""
         text, known = channel.definition, self._known if channel.encoding == CDR else {}
         if channel.language == "NONE":
+            if known and channel.type not in known:
+                raise ValueError("its definition was not sent, and it is none of ROS's own types")
             return known
         try:
             if channel.language == "MSG":

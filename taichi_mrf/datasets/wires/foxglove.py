@@ -5,19 +5,15 @@ asks for those it wants (``subscribe``). A message is a binary frame: the byte 1
 subscription (uint32), the time at which the server logged it (uint64, nanoseconds), all in little endian, and
 the message as ROS encodes it (https://github.com/foxglove/ws-protocol).
 
-A thread receives. Of images, which come faster than they can be mapped, the oldest that nobody has taken is
-dropped for a new one. A connection that is lost is made again, with the same topics.
+A thread receives. A connection that is lost is made again, with the same topics.
 """
 
 import json
 import socket
 import struct
 import threading
-import time
-from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,27 +21,15 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import CDR, LANGUAGES, ROS1, ros2_name
 from taichi_mrf.datasets.ros.sources import Channel
+from taichi_mrf.datasets.wires.client import Client
 from taichi_mrf.datasets.wires.schemas import JSON, PROTOBUF, ROS_TYPES
 from taichi_mrf.errors import DatasetError, said
 
 SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
 PORT = 8765
 BRIDGE = "ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
-
-MOST_IMAGES = 64
-"""Images that wait to be taken; two seconds of a camera, so that slow poses find theirs."""
-
-RATE_S = 5.0
-"""Seconds over which the rate of images is averaged."""
-
-MOST_TIMES = 1000
-"""Times of images that are counted: RATE_S at 200 Hz."""
-
-MOST_OTHERS = 100_000
-"""Other messages that wait to be taken: a quarter of an hour of tf at 100 Hz."""
 
 LARGEST = 1 << 28
 """Bytes of a frame at most."""
@@ -57,37 +41,18 @@ _MESSAGE = struct.Struct("<BIQ")
 _MESSAGE_DATA = 1
 
 
-@dataclass(frozen=True)
-class Raw:
-    """A message as it came: its channel, when the server logged it, when it ``arrived_s`` on this machine's
-    monotonic clock, and its bytes."""
-
-    channel: Channel
-    logged_ns: int
-    arrived_s: float
-    data: bytes
-
-
-class FoxgloveClient:
-    """A connection to a server. ``channels`` are those that it has now by their topics, ``dropped`` counts
-    the images of a topic that nobody took in time; ``problem`` says why nothing comes while the connection is
-    lost."""
+class FoxgloveClient(Client):
+    """A connection to a server."""
 
     def __init__(self, address: str) -> None:
         """Connect to ``ws://host:port``; the scheme and the port may be missing. Raises DatasetError, which
         names the address, if nobody listens there or another program does."""
-        self.address = _whole(address)
-        self.channels: dict[str, Channel] = {}
-        self.dropped: Counter[str] = Counter()
-        self.problem = ""
+        whole = _whole(address)
+        super().__init__(whole, f"foxglove:{whole}")
         self._wanted: set[str] = set()
         self._subscribed: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
         self._by_number: dict[int, str] = {}
-        self._images: deque[tuple[int, Raw]] = deque()
-        self._others: deque[tuple[int, Raw]] = deque(maxlen=MOST_OTHERS)
-        self._times: dict[str, deque[float]] = {}
-        self._came, self._lock = 0, threading.Lock()
         self._advertised, self._ended = threading.Event(), threading.Event()
         self._connection = self._connect()
         self._thread = threading.Thread(target=self._receive, name="foxglove", daemon=True)
@@ -110,23 +75,6 @@ class FoxgloveClient:
         if gone:
             self._send({"op": "unsubscribe", "subscriptionIds": gone})
         self._send_subscribe(new)
-
-    def take(self) -> list[Raw]:
-        """The messages that have come since the last call, in the order in which they came."""
-        with self._lock:
-            found = sorted([*self._images, *self._others], key=lambda each: each[0])
-            self._images.clear()
-            self._others.clear()
-        return [raw for _, raw in found]
-
-    def rate_hz(self, topic: str) -> float:
-        """Images of a topic a second, over the last RATE_S seconds."""
-        since = time.monotonic() - RATE_S
-        with self._lock:
-            times = self._times.get(topic, deque())
-            while times and times[0] < since:
-                times.popleft()
-            return len(times) / RATE_S
 
     def close(self) -> None:
         """End the connection."""
@@ -202,18 +150,8 @@ class FoxgloveClient:
         _, number, logged_ns = _MESSAGE.unpack_from(frame)
         with self._lock:
             channel = self._subscribed.get(number)
-            if channel is None:
-                return
-            self._came += 1
-            raw = self._came, Raw(channel, logged_ns, time.monotonic(), frame[_MESSAGE.size :])
-            if channel.type not in messages.OF_SENSORS:
-                self._others.append(raw)
-                return
-            self._images.append(raw)
-            self._times.setdefault(channel.topic, deque(maxlen=MOST_TIMES)).append(raw[1].arrived_s)
-            if len(self._images) > MOST_IMAGES:
-                _, oldest = self._images.popleft()
-                self.dropped[oldest.channel.topic] += 1
+            if channel is not None:
+                self._keep(channel, logged_ns, frame[_MESSAGE.size :])
 
     def _take_in_words(self, words: dict[str, Any]) -> None:
         if words.get("op") == "advertise":
@@ -254,16 +192,6 @@ class FoxgloveClient:
     def _send(self, words: dict[str, Any]) -> None:
         with suppress(ConnectionClosed):  # the thread connects again, and subscribes
             self._connection.send(json.dumps(words))
-
-
-def wait_until(done: Callable[[], bool], seconds: float, step_s: float = 0.01) -> bool:
-    """Wait until ``done()``, for some seconds at most; returns whether it is."""
-    end = time.monotonic() + seconds
-    while not done():
-        if time.monotonic() >= end:
-            return False
-        time.sleep(step_s)
-    return True
 
 
 def _channel(words: dict[str, Any]) -> Channel:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import Decoder
 from taichi_mrf.datasets.ros.sources import Channel, Entry, Topic, TopicSource, entry_of
-from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, FoxgloveClient
+from taichi_mrf.datasets.wires.client import MOST_IMAGES, Client
 from taichi_mrf.datasets.wires.schemas import SchemaDecoder
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.libraries import library
@@ -32,11 +32,10 @@ class HeardTopics(TopicSource):
     """Topics that a client hears. Until :meth:`forget` is called, messages are kept, of images the last
     MOST_IMAGES of a topic."""
 
-    def __init__(self, name: str, client: FoxgloveClient) -> None:
-        """``name`` is that of the source, which errors begin with. Raises DatasetError if rosbags is not
-        installed."""
-        library("rosbags.highlevel", f"{name}: messages of ROS need", "ros", DatasetError)
-        self.path, self.client = name, client
+    def __init__(self, client: Client) -> None:
+        """Raises DatasetError if rosbags is not installed."""
+        library("rosbags.highlevel", f"{client.source}: messages of ROS need", "ros", DatasetError)
+        self.path, self.client = client.source, client
         self.topics = {}
         self.broken: Counter[str] = Counter()
         self.problem = ""

@@ -1,5 +1,6 @@
 """``foxglove:ws://robot:8765?depth=/camera/depth/image_raw&pose=/odom&frame=map``: depth images, or
-``?points=/points`` point clouds, from a robot that runs, whose ``foxglove_bridge`` sends its topics.
+``?points=/points`` point clouds, from a robot that runs, whose ``foxglove_bridge`` sends its topics; or
+``zenoh:tcp/robot:7447`` from one whose ROS 2 runs over Zenoh.
 
 Topics, cameras and poses are chosen as in a bag (ros/sensor.py), from what is heard in the first seconds, and
 by the same options. How messages become frames is in stream.py.
@@ -9,7 +10,7 @@ import time
 import weakref
 from collections.abc import Collection, Iterable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.depth_scale import check_metres
+from taichi_mrf.datasets.entries import FOXGLOVE, ZENOH
 from taichi_mrf.datasets.lidar.scans import reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
@@ -33,8 +35,10 @@ from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
 from taichi_mrf.datasets.timed_poses import largest_gap
+from taichi_mrf.datasets.wires.client import Client
 from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
 from taichi_mrf.datasets.wires.heard import NEEDED, HeardTopics
+from taichi_mrf.datasets.wires.rmw_zenoh import ZenohClient
 from taichi_mrf.datasets.wires.stream import CameraRobot, LidarRobot, Robot
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
@@ -52,14 +56,29 @@ _LOOKED_AT = 4
 ENDLESS = "a robot never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
+@dataclass(frozen=True)
+class ZenohChoice(SensorChoice):
+    """What is chosen of a robot whose ROS 2 runs over Zenoh."""
+
+    domain: int = 0
+    """The robot's ROS_DOMAIN_ID."""
+
+
 def open_foxglove(text: str, options: ReadOptions) -> Dataset:
     """Connect to a robot: ``ADDRESS?option=value&...``. Raises DatasetError, which names the address, if it
     cannot be reached, and as a bag does if it is not clear what to map."""
-    address, _, query = text.partition("?")
-    chosen = parse_options(SensorChoice, query, f"foxglove:{address}")
+    return _opened(f"{FOXGLOVE}{text}", options)
+
+
+def open_zenoh(text: str, options: ReadOptions) -> Dataset:
+    """The same over Zenoh, where the address may be missing."""
+    return _opened(f"{ZENOH}{text}", options)
+
+
+def _opened(source: str, options: ReadOptions) -> Dataset:
+    heard, chosen = _connected(source)
     if options.track:
         chosen = replace(chosen, poses=TRACK)
-    heard = _connected(address)
     try:
         robot = _open(heard, chosen, options)
     except BaseException:
@@ -69,9 +88,9 @@ def open_foxglove(text: str, options: ReadOptions) -> Dataset:
     return robot
 
 
-def summarise(address: str) -> BagSummary:
+def summarise(source: str) -> BagSummary:
     """What a robot sends, from a few seconds of listening. Raises DatasetError."""
-    heard = _connected(address)
+    heard, _ = _connected(source)
     try:
         _listen(heard, _needed(heard, SensorChoice()))
         return summary_of(heard)
@@ -79,10 +98,20 @@ def summarise(address: str) -> BagSummary:
         heard.client.close()
 
 
-def _connected(address: str) -> HeardTopics:
-    client = FoxgloveClient(address)
+def _connected(source: str) -> tuple[HeardTopics, SensorChoice]:
+    """A robot's topics, and what its options choose."""
+    name, _, query = source.partition("?")
+    address = name.partition(":")[2]
+    client: Client
+    choice: SensorChoice
+    if name.startswith(ZENOH):
+        choice = of_zenoh = parse_options(ZenohChoice, query, name)
+        client = ZenohClient(address, of_zenoh.domain)
+    else:
+        choice = parse_options(SensorChoice, query, name)
+        client = FoxgloveClient(address)
     try:
-        return HeardTopics(f"foxglove:{client.address}", client)
+        return HeardTopics(client), choice
     except BaseException:
         client.close()
         raise

@@ -21,7 +21,7 @@ from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera
 from taichi_mrf.datasets.ros.sources import Entry
 from taichi_mrf.datasets.trajectories import RESTART_S
-from taichi_mrf.datasets.wires.foxglove import MOST_IMAGES, wait_until
+from taichi_mrf.datasets.wires.client import MOST_IMAGES, wait_until
 from taichi_mrf.datasets.wires.heard import Heard, HeardTopics
 from taichi_mrf.errors import DatasetError, FrameError, naming
 from taichi_mrf.geometry.poses import Pose
