@@ -16,7 +16,8 @@ from queried_maps import room_map
 
 import taichi_mrf as tm
 from taichi_mrf.config.arguments import ArgumentTypeError
-from taichi_mrf.datasets.wires.foxglove import FoxgloveClient, wait_until
+from taichi_mrf.datasets.wires.client import wait_until
+from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
 
