@@ -86,9 +86,8 @@ class MessageServer:
 
     def send(self, m: OccupancyMap, at_rest: bool, poses: Mapping[float, Pose]) -> bool:
         """Send one message if one is due, with the ``poses`` of keyframes by their stamps in seconds; returns
-        whether there was one. The map is sent as ``m.decided`` if it is ``at_rest``, with its surface, and
-        else by its marginals. Raises TaichiMRFError if the message cannot be made; it is not tried again
-        before the map has changed."""
+        whether there was one. The surface is sent once the map is ``at_rest``. Raises TaichiMRFError if the
+        message cannot be made; it is not tried again before the map has changed."""
         due = [(self._sent[topic].begun_s, topic) for wait, topic in self._waits(m, at_rest) if wait <= 0]
         if not due:
             return False
@@ -108,8 +107,7 @@ class MessageServer:
             if newest_s is not None:
                 self._channels.transform(poses[newest_s], newest_s)
         else:
-            by = m.decided if at_rest else m.marginals
-            MESSAGES[topic](self._channels, MapToSend(m, by, self._options, poses))
+            MESSAGES[topic](self._channels, MapToSend(m, m.decided, self._options, poses))
 
     def start_over(self) -> None:
         """Send everything again: the map is another one."""

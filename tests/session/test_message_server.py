@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import small_room
 from console import assert_refused, taichi_mrf
@@ -20,6 +21,8 @@ from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
 
 mcap = pytest.importorskip("mcap.reader", reason="MCAP files are read by its own library: pip install mcap")
 pytest.importorskip("foxglove", reason="messages need the extra robot")
@@ -106,7 +109,7 @@ def test_only_what_has_changed_is_sent_and_only_to_who_subscribes(monkeypatch: p
             m.renew([small_room.add(m, frames[1])])
             for _ in range(4):
                 served.update()
-            assert len(made) == 2  # by marginals, and by what is occupied as the map rests
+            assert len(made) == 2  # while frames come, and as the map rests
             assert set(received(first, 1)) == {"/map/voxels"}
             with client_of(served.address, "/map/voxels") as second:
                 assert received(second, 1, served.update)
@@ -117,6 +120,29 @@ def test_only_what_has_changed_is_sent_and_only_to_who_subscribes(monkeypatch: p
         m.renew([small_room.add(m, frames[2])])
         served.update()
         assert len(made) == 4
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_post_thinner_than_a_voxel_is_sent_while_frames_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Marginals call it free: rays that pass beside it outvote those that end on it."""
+    camera, post_m = PinholeCamera(96, 72, 80.0, 80.0, 47.5, 35.5), np.array([0.02, 0.02, 1.02])
+    m, sent = MRFMap(0.05, PolynomialNoise(sigma=(0.004,))), []
+    with tm.publish(m, port=0, every_s=0.0) as served:
+        channels = served._server._channels
+        monkeypatch.setattr(channels, "voxels", lambda centres_m, *_: sent.append(centres_m))
+        with client_of(served.address, "/map/voxels"):
+            assert wait_until(lambda: channels.are_wanted("/map/voxels"), DEADLINE_S)
+            for x_m in np.linspace(-0.4, 0.4, 10):
+                across_m = x_m + (np.arange(camera.width) - camera.cx) / camera.fx * post_m[2]
+                depth_m = np.where(np.abs(across_m - post_m[0]) < 0.012, post_m[2], 2.02)
+                T_world_camera = np.eye(4)
+                T_world_camera[0, 3] = x_m
+                image = np.tile(depth_m.astype(np.float32), (camera.height, 1))
+                m.infer(sweeps=1, keyframes=[m.add_keyframe(image, T_world_camera, camera)])
+            assert not m.settled
+            assert served._server.send(m, False, {})
+    assert m.marginals.occupancy([post_m])[0] < 0.05
+    assert (np.abs(sent[0] - post_m).max(axis=1) < 0.5 * m.voxel_size + 1e-6).any()
 
 
 @pytest.mark.usefixtures("one_backend")
