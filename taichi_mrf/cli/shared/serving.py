@@ -3,8 +3,10 @@
 import os
 import webbrowser
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from taichi_mrf.viewer.messages import Listening
+if TYPE_CHECKING:  # options are parsed with this file, and need no NumPy
+    from taichi_mrf.viewer.messages import Listening
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -34,7 +36,7 @@ def let_the_page_go_first() -> None:
 
 
 def print_address(
-    where: Listening, what: str, wanted_port: int, open_browser: bool, print_line: PrintLine
+    where: "Listening", what: str, wanted_port: int, open_browser: bool, print_line: PrintLine
 ) -> None:
     """Print the page's address, and before it that another port was taken than the requested one (0: any);
     open a browser if asked."""
