@@ -11,6 +11,7 @@ the map's origin is in the recorded world, unless that is 0.
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -232,20 +233,22 @@ def _level_map(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     return write_map_server(path.parent, image, found.cell_size, corner_m, path.stem, _plan_note(up))
 
 
-def _level(decided: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
-    band = options.z_min, options.z_max, options.occupied_from, options.free_below
-    return level_map(decided, *band, up)
+def _level(m: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
+    return level_map(m, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
 
 
 @dataclass(frozen=True)
 class MapToSend:
-    """What messages are made from: a map, the reading of it whose voxels are sent, and ``poses``, those of
-    keyframes by their stamps in seconds."""
+    """What messages are made from: a map, and ``poses``, those of keyframes by their stamps in seconds."""
 
     m: VoxelMap
-    by: VoxelMap
     options: ExportOptions
     poses: Mapping[float, Pose]
+
+    @cached_property
+    def decided(self) -> VoxelMap:
+        """The reading of the map whose voxels are sent, found once for all messages."""
+        return self.m.decided
 
     @property
     def stamp_s(self) -> float:
@@ -255,11 +258,11 @@ class MapToSend:
 
 def _messages(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     keyframes = getattr(m, "keyframes", {}).values()
-    sent = MapToSend(m, m.decided, options, {k.stamp_s: k.T_world_camera for k in keyframes})
+    sent = MapToSend(m, options, {k.stamp_s: k.T_world_camera for k in keyframes})
 
     def log(channels: MapChannels) -> None:
-        for stamp_s, T_world_camera in sorted(sent.poses.items(), key=lambda each: each[0]):
-            channels.transform(T_world_camera, stamp_s)
+        for stamp_s in sorted(sent.poses):
+            channels.transform(sent.poses[stamp_s], stamp_s)
         for log_message in MESSAGES.values():
             log_message(channels, sent)
 
@@ -271,7 +274,7 @@ def _log_costmap(channels: MapChannels, sent: MapToSend) -> None:
     """Without a band of heights there is no costmap."""
     options, up = sent.options, _up(sent.m, sent.options)
     if options.z_min is not None or options.z_max is not None:
-        channels.costmap(_level(sent.by, options, up), up[1] * (options.z_min or 0.0), sent.stamp_s)
+        channels.costmap(_level(sent.decided, options, up), up[1] * (options.z_min or 0.0), sent.stamp_s)
 
 
 def _log_path(channels: MapChannels, sent: MapToSend) -> None:
@@ -280,15 +283,14 @@ def _log_path(channels: MapChannels, sent: MapToSend) -> None:
 
 
 def _log_surface(channels: MapChannels, sent: MapToSend) -> None:
-    m, options = sent.m, sent.options
-    measured = _with_rays(m, Path(SURFACE), options)
-    surface = smooth_surface(m, options.threshold) if measured is None else measured_surface(measured)
+    measured, threshold = _with_rays(sent.m, Path(SURFACE), sent.options), sent.options.threshold
+    surface = smooth_surface(sent.m, threshold) if measured is None else measured_surface(measured)
     channels.surface(surface, sent.stamp_s)
 
 
 MESSAGES: dict[str, Callable[[MapChannels, MapToSend], None]] = {
-    CLOUD: lambda to, sent: to.voxels(*_points(sent.by, Path(CLOUD), sent.options), sent.stamp_s),
-    OCTOMAP: lambda to, sent: to.octomap(sent.by, sent.options.cells, sent.stamp_s),
+    CLOUD: lambda to, sent: to.voxels(*_points(sent.decided, Path(CLOUD), sent.options), sent.stamp_s),
+    OCTOMAP: lambda to, sent: to.octomap(sent.decided, sent.options.cells, sent.stamp_s),
     COSTMAP: _log_costmap,
     PATH: _log_path,
     SURFACE: _log_surface,

@@ -107,7 +107,7 @@ class MessageServer:
             if newest_s is not None:
                 self._channels.transform(poses[newest_s], newest_s)
         else:
-            MESSAGES[topic](self._channels, MapToSend(m, m.decided, self._options, poses))
+            MESSAGES[topic](self._channels, MapToSend(m, self._options, poses))
 
     def start_over(self) -> None:
         """Send everything again: the map is another one."""

@@ -8,19 +8,18 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from heard import SECONDS, heard
 from inputs_bags import INFO, TOPIC, plain, write_bag
 
 from taichi_mrf.datasets.wires import client as clients
 from taichi_mrf.datasets.wires import foxglove
-from taichi_mrf.datasets.wires.client import Raw, wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
 from taichi_mrf.errors import DatasetError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
 from foxglove_robot import Robot, robot
-
-SECONDS = 20
 
 
 @pytest.fixture
@@ -34,17 +33,6 @@ def client(walk: Robot) -> Iterator[FoxgloveClient]:
     found = FoxgloveClient(f"127.0.0.1:{walk.port}")
     yield found
     found.close()
-
-
-def heard(client: FoxgloveClient, count: int) -> list[Raw]:
-    found: list[Raw] = []
-
-    def enough() -> bool:
-        found.extend(client.take())
-        return len(found) >= count
-
-    assert wait_until(enough, SECONDS), f"{len(found)} of {count} messages"
-    return found
 
 
 def test_channels_and_messages_are_those_of_the_bag(walk: Robot, client: FoxgloveClient) -> None:

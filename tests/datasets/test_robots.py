@@ -14,6 +14,7 @@ import inputs_bags
 import numpy as np
 import pytest
 from datasets_recordings import CAMERA
+from heard import SECONDS, came, follow_bag, whole
 from inputs_bags import (
     COUNT,
     EYE,
@@ -50,7 +51,6 @@ pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
 from foxglove_robot import Robot, robot
 
-SECONDS = 20
 Part = Callable[[Bag], object]
 Begin = Callable[..., Any]
 
@@ -117,20 +117,7 @@ IMAGES: dict[str, Part] = {
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", IMAGES)
 def test_frames_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str, way: str) -> None:
-    sender, live, bag = begin(IMAGES[kind], mounted, WAYS[way], first=4)
-    recorded = open_dataset(bag, color=False)
-    assert live.endless
-    assert live.camera == recorded.camera
-    for number in range(COUNT):
-        assert wait_until(lambda number=number: came(live) == number + 1, SECONDS)
-        assert "the next image" in live.awaiting()  # the pose after it has not come
-        sender.send_next(1)
-        assert wait_until(lambda: not live.awaiting(), SECONDS)
-        sender.send_next(1)
-        ours, theirs = live.read(number), recorded.read(number)
-        assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
-        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
-        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+    follow_bag(*begin(IMAGES[kind], mounted, WAYS[way], first=4), COUNT)
 
 
 def test_ros_1_is_read_too(begin: Begin) -> None:
@@ -139,12 +126,6 @@ def test_ros_1_is_read_too(begin: Begin) -> None:
     ours, theirs = live.read(0), open_dataset(bag, color=False).read(COUNT - 1)
     np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
     np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
-
-
-def came(live: Dataset) -> int:
-    """Images that have come so far."""
-    live.awaiting()
-    return whole(live)._came
 
 
 def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
@@ -419,14 +400,6 @@ def test_poses_of_a_camera_link_are_turned_if_images_agree_so(begin: Begin, is_b
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
     np.testing.assert_allclose(live.read(0).T_world_camera, EYES[-1], atol=1e-6)
     assert any("of a body, x ahead and z up" in note for note in live.notes) == is_body
-
-
-def whole(live: Dataset) -> stream.Robot:
-    """The robot behind what mends its frames."""
-    while hasattr(live, "source"):
-        live = live.source
-    assert isinstance(live, stream.Robot)
-    return live
 
 
 def has_heard(live: Dataset, count: int) -> bool:

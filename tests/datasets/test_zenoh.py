@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from heard import SECONDS, came, follow_bag, heard
 from inputs_bags import COUNT, INFO, TOPIC, images, mounted, moving_tf, odometry, plain, steps, write_bag
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.wires import rmw_zenoh, stream
+from taichi_mrf.datasets.wires import rmw_zenoh
 from taichi_mrf.datasets.wires import robot as wired
-from taichi_mrf.datasets.wires.client import Raw, wait_until
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.datasets.wires.rmw_zenoh import ZenohClient, published_ns, publisher_of
 from taichi_mrf.errors import DatasetError
 
@@ -25,7 +26,6 @@ pytest.importorskip("zenoh", reason="needs eclipse-zenoh")
 
 from zenoh_robot import Robot, free_port, robot
 
-SECONDS = 20
 BETWEEN = np.arange(-0.5, COUNT).tolist()
 """Poses half a step before and after each image."""
 
@@ -102,17 +102,6 @@ def test_protocol_and_port_may_be_missing(address: str, whole: str) -> None:
     assert rmw_zenoh._whole(address) == whole
 
 
-def heard(client: ZenohClient, count: int) -> list[Raw]:
-    found: list[Raw] = []
-
-    def enough() -> bool:
-        found.extend(client.take())
-        return len(found) >= count
-
-    assert wait_until(enough, SECONDS), f"{len(found)} of {count} messages"
-    return found
-
-
 @pytest.fixture(params=["node", "router", "peer"])
 def walk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Robot]:
     with robot(write_bag(tmp_path, plain, kind="mcap"), mode=request.param) as found:
@@ -182,20 +171,6 @@ def begun(sender: Robot, first: int, query: str = "", listen_to: str = "/odom") 
         thread.join()
 
 
-def whole(live: Dataset) -> stream.Robot:
-    """The robot behind what mends its frames."""
-    while hasattr(live, "source"):
-        live = live.source
-    assert isinstance(live, stream.Robot)
-    return live
-
-
-def came(live: Dataset) -> int:
-    """Images that have come so far."""
-    live.awaiting()
-    return whole(live)._came
-
-
 def metres(i: int) -> np.ndarray:
     return steps(i).astype(np.float32) / 1000
 
@@ -210,19 +185,7 @@ def test_frames_are_those_of_the_bag_bit_for_bit(tmp_path: Path, kind: str, way:
     bag = write_bag(tmp_path, IMAGES[kind], mounted, WAYS[way], kind="mcap")
     with robot(bag) as sender:
         live = begun(sender, 4, listen_to="/odom" if way == "odometry" else "/tf")
-        recorded = open_dataset(bag, color=False)
-        assert live.endless
-        assert live.camera == recorded.camera
-        for number in range(COUNT):
-            assert wait_until(lambda number=number: came(live) == number + 1, SECONDS)
-            assert "the next image" in live.awaiting()  # the pose after it has not come
-            sender.send_next(1)
-            assert wait_until(lambda: not live.awaiting(), SECONDS)
-            sender.send_next(1)
-            ours, theirs = live.read(number), recorded.read(number)
-            assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
-            np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
-            np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+        follow_bag(sender, live, bag, COUNT)
 
 
 def test_a_robot_that_has_fixed_transforms_before_is_listened_to_is_mapped(tmp_path: Path) -> None:

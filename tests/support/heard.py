@@ -1,0 +1,55 @@
+"""What a client of a robot's wire hears, and what a recording made of it shows: frames that are the bag's."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.wires import stream
+from taichi_mrf.datasets.wires.client import Client, Raw, wait_until
+
+SECONDS = 20
+
+
+def heard(client: Client, count: int) -> list[Raw]:
+    """The messages that come, once they are ``count``."""
+    found: list[Raw] = []
+
+    def enough() -> bool:
+        found.extend(client.take())
+        return len(found) >= count
+
+    assert wait_until(enough, SECONDS), f"{len(found)} of {count} messages"
+    return found
+
+
+def whole(live: Dataset) -> stream.Robot:
+    """The robot behind what mends its frames."""
+    while hasattr(live, "source"):
+        live = live.source
+    assert isinstance(live, stream.Robot)
+    return live
+
+
+def came(live: Dataset) -> int:
+    """Images that have come so far."""
+    live.awaiting()
+    return whole(live)._came
+
+
+def follow_bag(sender: Any, live: Dataset, bag: Path, count: int) -> None:
+    """A robot sends an image, and then the pose after it: each frame is that of the bag, bit for bit."""
+    recorded = open_dataset(bag, color=False)
+    assert live.endless
+    assert live.camera == recorded.camera
+    for number in range(count):
+        assert wait_until(lambda number=number: came(live) == number + 1, SECONDS)
+        assert "the next image" in live.awaiting()  # the pose after it has not come
+        sender.send_next(1)
+        assert wait_until(lambda: not live.awaiting(), SECONDS)
+        sender.send_next(1)
+        ours, theirs = live.read(number), recorded.read(number)
+        assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
+        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
