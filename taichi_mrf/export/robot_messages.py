@@ -5,6 +5,7 @@ keyframes. ROS 2's types, for planners: a costmap (nav_msgs/OccupancyGrid), as N
 (octomap_msgs/Octomap), as MoveIt takes it. All are in the frame ``map``, the map's own world.
 """
 
+import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -200,12 +201,12 @@ def write_mcap(path: Path, log: Callable[[MapChannels], None]) -> None:
     """Write what ``log`` logs to a file. Raises MapFileError, and TaichiMRFError without the extra
     ``robot``."""
     foxglove = library("foxglove", ".mcap files need", "robot")
-    context = foxglove.Context()
-    with (
-        atomic_path(path) as temporary,
-        foxglove.open_mcap(str(temporary), context=context, allow_overwrite=True),
-    ):
+    # In memory first: of a disk that is full the writer tells only that a write before has failed.
+    context, content = foxglove.Context(), io.BytesIO()
+    with foxglove.open_mcap(content, context=context):
         log(MapChannels(context))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 def nanoseconds(stamp_s: float) -> int:

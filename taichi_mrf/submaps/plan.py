@@ -22,6 +22,7 @@ from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.config.text import differences
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.geometry.up import Z_UP, Up
 from taichi_mrf.system.atomic import write_text
@@ -174,7 +175,7 @@ class Job:
             plan = content["plan"]
             submaps = [Submap(tuple(s["cell"]), tuple(s["keyframes"])) for s in plan["submaps"]]
             return Job(
-                SourceFrames(**content["sequence"]),
+                _frames(content["sequence"]),
                 from_dict(Config, parse_yaml(content["config"]), str(path), of_map=True),
                 content["submap_size"],
                 Plan(plan["chunks_across"], tuple(submaps)),
@@ -192,3 +193,12 @@ class Job:
         found = [name for name in mine if mine[name] != other[name]]
         found += [name for name in differences(self.config, config) if not name.startswith(FREE_TO_DIFFER)]
         return found + (["submap_size"] if submap_size != self.submap_size else [])
+
+
+def _frames(stored: dict[str, Any]) -> SourceFrames:
+    """The frames that a file names; of the robot's own body it has the fields."""
+    reading = dict(stored["reading"])
+    if body := reading.get("body"):
+        boxes = tuple(tuple(box) for box in body["body_box"])
+        reading["body"] = OwnBody(**{**body, "body_box": boxes})
+    return SourceFrames(**{**stored, "reading": reading})

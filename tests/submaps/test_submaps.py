@@ -22,6 +22,7 @@ from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_kil
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
+from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.export.fused_surface import FusedSurface
@@ -30,7 +31,7 @@ from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import Job, SeenFrame, SourceFrames, chunks_for, plan_submaps
+from taichi_mrf.submaps.plan import Job, Plan, SeenFrame, SourceFrames, chunks_for, plan_submaps
 from taichi_mrf.submaps.round_files import read_core, read_report, round_path
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.submaps.task import share_moved
@@ -121,6 +122,13 @@ def test_what_is_told_leaves_out_what_the_listener_knows(one_backend: str) -> No
     assert (before[left] != told[left]).any()
     # A brick that only keyframe 1 wanted holds what the others say all the same.
     assert left.mean() < 1
+
+
+def test_the_robots_own_body_is_read_back(tmp_path: Path) -> None:
+    body = OwnBody(mask="body.png", body_box=((0.0, -0.1, 0.0, 0.5, 0.1, 0.4),), body_margin=0.03)
+    job = Job(SourceFrames(SOURCE, {"body": body}), CONFIG, SUBMAP_M, Plan(2, ()), {}, {})
+    job.write(tmp_path)
+    assert Job.read(tmp_path).sequence == job.sequence
 
 
 @cache
