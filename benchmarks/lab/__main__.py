@@ -25,6 +25,7 @@ EXPERIMENTS = {
     "sensors": Entry("benchmarks.lab.sensors:run_sensors", (0.05,), needs_data=False),
     "trajectory": Entry("benchmarks.lab.trajectory.tables:run_trajectory", (0.05,), has_parts=True),
     "window": Entry("benchmarks.lab.window:run_window", (0.1,), needs_data=False),
+    "wire": Entry("benchmarks.lab.wire:run_wire", (), has_parts=True),
 }
 
 if __name__ == "__main__":
