@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
-DOCS = ("evaluation.md", "benchmarks.md", "performance.md", "free.md")
+DOCS = ("evaluation.md", "benchmarks.md", "own_robot.md", "performance.md", "free.md")
 PAGES = (ROOT / "README.md", *(ROOT / "docs" / name for name in DOCS))
 BEST_IS_LARGEST = ("peers", "lidar_points")
 """Files whose largest figure of a column is bold, among the rows that differ in the last name alone."""

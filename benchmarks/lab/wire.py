@@ -251,7 +251,7 @@ class _Run:
         with np.load(live) as ours, np.load(of_bag) as theirs:
             names = {*ours, *theirs} - NOT_OF_THE_MAP
             apart = [name for name in sorted(names) if not _same(ours, theirs, name)]
-        return ", ".join(apart) or "yes", *(self._right(m) for m in maps)
+        return ", ".join(apart) or "yes", self._right(maps[0]), self._right(maps[1])
 
     def _right(self, m: Any) -> float:
         scores = [
