@@ -8,7 +8,7 @@ keyframes. ROS 2's types, for planners: a costmap (nav_msgs/OccupancyGrid), as N
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,37 @@ def require_libraries(what: str) -> None:
     """Raise TaichiMRFError, which begins with ``what``, without the libraries that messages need."""
     library("foxglove", what, "robot")
     library("rosbags.typesys", what, "robot")
+
+
+class Points(NamedTuple):
+    """Voxels and cells: centres (n, 3), probabilities and sizes (n,), and colours (n, 3) if there are any."""
+
+    centres_m: NDArray[np.float64]
+    probability: NDArray[np.float32]
+    sizes_m: NDArray[np.float64]
+    colors: NDArray[np.uint8] | None
+
+
+class MapSink(Protocol):
+    """What takes the messages of a map: the channels of a file, a server or a robot's wire."""
+
+    def transform(self, T_world_camera: Pose, stamp_s: float) -> None:
+        """Take the pose (4, 4) of a keyframe as that of the frame CAMERA."""
+
+    def path(self, T_world_camera: Mapping[float, Pose]) -> None:
+        """Take the poses (4, 4) of keyframes by their stamps in seconds as a path."""
+
+    def voxels(self, points: Points, stamp_s: float) -> None:
+        """Take voxels as points."""
+
+    def surface(self, surface: Surface, stamp_s: float) -> None:
+        """Take triangles; they take the place of those before."""
+
+    def costmap(self, level: LevelMap, height_m: float, stamp_s: float) -> None:
+        """Take a floor plan, which lies ``height_m`` along the axis up."""
+
+    def octomap(self, decided: VoxelMap, cells: bool, stamp_s: float) -> None:
+        """Take which voxels are free and which occupied."""
 
 
 class MapChannels:
@@ -84,27 +115,19 @@ class MapChannels:
         path = self._messages.PosesInFrame(timestamp=self._time(newest_s), frame_id=WORLD, poses=poses)
         self._path.log(path, log_time=nanoseconds(newest_s))
 
-    def voxels(
-        self,
-        centres_m: NDArray[np.float64],
-        probability: NDArray[np.float32],
-        sizes_m: NDArray[np.float64],
-        colors: NDArray[np.uint8] | None,
-        stamp_s: float,
-    ) -> None:
-        """Log voxels as points: centres (n, 3), probabilities and sizes (n,), and colours (n, 3) if there are
-        any."""
+    def voxels(self, points: Points, stamp_s: float) -> None:
+        """Log voxels as points."""
         columns: dict[str, NDArray[Any]] = {
-            **dict(zip("xyz", centres_m.astype("<f4").T, strict=True)),
-            "probability": probability.astype("<f4"),
-            "size": sizes_m.astype("<f4"),
+            **dict(zip("xyz", points.centres_m.astype("<f4").T, strict=True)),
+            "probability": points.probability.astype("<f4"),
+            "size": points.sizes_m.astype("<f4"),
         }
-        if colors is not None:
+        if points.colors is not None:
             names = ("red", "green", "blue")
-            columns |= dict(zip(names, colors.T, strict=True)) | {
-                "alpha": np.full(len(colors), 255, np.uint8)
+            columns |= dict(zip(names, points.colors.T, strict=True)) | {
+                "alpha": np.full(len(points.colors), 255, np.uint8)
             }
-        records = np.zeros(len(centres_m), [(name, column.dtype) for name, column in columns.items()])
+        records = np.zeros(len(points.centres_m), [(name, column.dtype) for name, column in columns.items()])
         for name, column in columns.items():
             records[name] = column
         numeric = self._messages.PackedElementFieldNumericType
@@ -136,9 +159,7 @@ class MapChannels:
 
     def costmap(self, level: LevelMap, height_m: float, stamp_s: float) -> None:
         """Log a floor plan as a nav_msgs/OccupancyGrid, which lies ``height_m`` along the axis up."""
-        cells = np.full(level.state.shape, UNKNOWN_CELL, np.int8)
-        cells[level.state == FREE], cells[level.state == OCCUPIED] = FREE_CELL, OCCUPIED_CELL
-        self._ros.costmap(cells, level.cell_size, _plan_pose(level, height_m), stamp_s)
+        self._ros.costmap(occupancy_cells(level), level.cell_size, plan_pose(level, height_m), stamp_s)
 
     def octomap(self, decided: VoxelMap, cells: bool, stamp_s: float) -> None:
         """Log which voxels are free and which occupied as a binary octomap_msgs/Octomap."""
@@ -197,7 +218,7 @@ class _RosChannels:
         self._by_type[name].log(content, log_time=nanoseconds(stamp_s))
 
 
-def write_mcap(path: Path, log: Callable[[MapChannels], None]) -> None:
+def write_mcap(path: Path, log: Callable[[MapSink], None]) -> None:
     """Write what ``log`` logs to a file. Raises MapFileError, and TaichiMRFError without the extra
     ``robot``."""
     foxglove = library("foxglove", ".mcap files need", "robot")
@@ -214,7 +235,14 @@ def nanoseconds(stamp_s: float) -> int:
     return max(0, round(stamp_s * 1e9))
 
 
-def _plan_pose(level: LevelMap, height_m: float) -> Pose:
+def occupancy_cells(level: LevelMap) -> NDArray[np.int8]:
+    """The cells (rows, columns) of a nav_msgs/OccupancyGrid, rows from the lowest coordinate up."""
+    cells = np.full(level.state.shape, UNKNOWN_CELL, np.int8)
+    cells[level.state == FREE], cells[level.state == OCCUPIED] = FREE_CELL, OCCUPIED_CELL
+    return cells
+
+
+def plan_pose(level: LevelMap, height_m: float) -> Pose:
     """T_world_plan (4, 4) of a plan whose columns run along x and whose rows run along y."""
     T = np.eye(4)
     right, forwards = level.axes
