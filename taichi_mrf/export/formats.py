@@ -25,21 +25,13 @@ from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.fused_surface import measured_surface
 from taichi_mrf.export.map_server import LevelMap, grey_image, level_map, write_map_server
+from taichi_mrf.export.map_sink import CLOUD, COSTMAP, OCTOMAP, PATH, SURFACE, MapSink, Points
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
 from taichi_mrf.export.rerun_file import require_rerun, write_rrd
-from taichi_mrf.export.robot_messages import (
-    CLOUD,
-    COSTMAP,
-    OCTOMAP,
-    PATH,
-    SURFACE,
-    MapSink,
-    Points,
-    write_mcap,
-)
 from taichi_mrf.export.robot_messages import require_libraries as require_message_libraries
+from taichi_mrf.export.robot_messages import write_mcap
 from taichi_mrf.export.surface import Surface, photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up

@@ -1,4 +1,4 @@
-"""A map's messages (export.robot_messages) as entities of a Rerun recording, in an .rrd file.
+"""A map's messages (map_sink.py) as entities of a Rerun recording, in an .rrd file.
 
 What belongs to the map as a whole holds at all times. Each keyframe's camera appears at its stamp on the time
 line STAMP, in seconds since 1970.
@@ -12,7 +12,7 @@ import numpy as np
 
 from taichi_mrf.datasets.timed_poses import quaternion
 from taichi_mrf.export.map_server import LevelMap
-from taichi_mrf.export.robot_messages import (
+from taichi_mrf.export.map_sink import (
     CLOUD,
     COSTMAP,
     PATH,
@@ -41,7 +41,7 @@ def require_rerun() -> Any:
 
 
 class RerunSink:
-    """Logs a map to a ``recording``; ``cameras`` are those of keyframes by their stamps in seconds."""
+    """A MapSink that logs to a ``recording``; ``cameras`` are those of keyframes by their stamps."""
 
     def __init__(self, recording: Any, cameras: Mapping[float, Camera], up: Up) -> None:
         self._rerun, self._recording, self._cameras = require_rerun(), recording, cameras
@@ -77,7 +77,6 @@ class RerunSink:
         self._log(CLOUD, logged, self._rerun.AnyValues(probability=points.probability))
 
     def surface(self, surface: Surface, stamp_s: float) -> None:
-        """Log triangles."""
         mesh = self._rerun.Mesh3D(
             vertex_positions=surface.vertices_m, triangle_indices=surface.triangles,
             vertex_normals=surface.normals, vertex_colors=surface.colors,
