@@ -9,7 +9,7 @@ the map's origin is in the recorded world, unless that is 0.
 """
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,19 +25,13 @@ from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.fused_surface import measured_surface
 from taichi_mrf.export.map_server import LevelMap, grey_image, level_map, write_map_server
+from taichi_mrf.export.map_sink import CLOUD, COSTMAP, OCTOMAP, PATH, SURFACE, MapSink, Points
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
-from taichi_mrf.export.robot_messages import (
-    CLOUD,
-    COSTMAP,
-    OCTOMAP,
-    PATH,
-    SURFACE,
-    MapChannels,
-    write_mcap,
-)
+from taichi_mrf.export.rerun_file import require_rerun, write_rrd
 from taichi_mrf.export.robot_messages import require_libraries as require_message_libraries
+from taichi_mrf.export.robot_messages import write_mcap
 from taichi_mrf.export.surface import Surface, photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
@@ -71,9 +65,9 @@ def export_map(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS
 
     ``m`` is any map, or a part of a chunked map (:func:`take_part`). The formats are ``.ply`` (points, or a
     mesh), ``.glb``, ``.obj`` and ``.stl`` (meshes), ``.bt`` and ``.ot`` (OctoMap), ``.pgm`` or ``.yaml`` (a
-    2D map for ROS), ``.mcap`` (messages for Foxglove and ROS 2), ``.npz`` (arrays), ``.html`` (a page that
-    shows the map) and ``.zarr`` (chunks, for :class:`ChunkedMap`). ``options`` are the formats' settings. A
-    file is written completely or not at all.
+    2D map for ROS), ``.mcap`` (messages for Foxglove and ROS 2), ``.rrd`` (the same for Rerun), ``.npz``
+    (arrays), ``.html`` (a page that shows the map) and ``.zarr`` (chunks, for :class:`ChunkedMap`).
+    ``options`` are the formats' settings. A file is written completely or not at all.
 
     Returns the paths of the files written; a 2D map has two. Raises ArgumentTypeError if ``m`` is no map,
     ConfigError for an unknown extension and for options that do not fit the map, MapFileError if the file
@@ -111,6 +105,8 @@ def require_libraries(path: str | Path) -> None:
         library("trimesh", f"{Path(path).suffix.lower()} files need", "mesh")
     elif writer is _messages:
         require_message_libraries(".mcap files need")
+    elif writer is _recording:
+        require_rerun()
 
 
 def extensions() -> Sequence[str]:
@@ -164,10 +160,7 @@ def _points_or_surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[
     return [path]
 
 
-def _points(
-    m: VoxelMap, path: Path, options: ExportOptions
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64], NDArray[np.uint8] | None]:
-    """Centres (n, 3), probabilities (n,), sizes (n,) and colours (n, 3) of voxels and cells, in metres."""
+def _points(m: VoxelMap, path: Path, options: ExportOptions) -> Points:
     centres, p = m.voxels(options.threshold)
     sizes = np.full(len(p), m.voxel_size)
     if options.cells:
@@ -176,7 +169,7 @@ def _points(
         p = np.concatenate([p, *(each.probability for each in cells)])
         sizes = np.concatenate([sizes, *(np.full(len(each), each.side * m.voxel_size) for each in cells)])
     colored = _photo(m, path, options)
-    return centres, p, sizes, None if colored is None else shown_colors(colored, centres)
+    return Points(centres, p, sizes, None if colored is None else shown_colors(colored, centres))
 
 
 def _surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
@@ -257,39 +250,48 @@ class MapToSend:
 
 
 def _messages(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
-    keyframes = getattr(m, "keyframes", {}).values()
-    sent = MapToSend(m, options, {k.stamp_s: k.T_world_camera for k in keyframes})
-
-    def log(channels: MapChannels) -> None:
-        for stamp_s in sorted(sent.poses):
-            channels.transform(sent.poses[stamp_s], stamp_s)
-        for log_message in MESSAGES.values():
-            log_message(channels, sent)
-
-    write_mcap(path, log)
+    write_mcap(path, lambda sink: _log_all(sink, m, options))
     return [path]
 
 
-def _log_costmap(channels: MapChannels, sent: MapToSend) -> None:
+def _recording(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
+    cameras = {k.stamp_s: k.camera for k in _keyframes(m)}
+    write_rrd(path, lambda sink: _log_all(sink, m, options), cameras, _up(m, options))
+    return [path]
+
+
+def _keyframes(m: VoxelMap) -> Iterable[Any]:
+    return getattr(m, "keyframes", {}).values()
+
+
+def _log_all(sink: MapSink, m: VoxelMap, options: ExportOptions) -> None:
+    sent = MapToSend(m, options, {k.stamp_s: k.T_world_camera for k in _keyframes(m)})
+    for stamp_s in sorted(sent.poses):
+        sink.transform(sent.poses[stamp_s], stamp_s)
+    for log_message in MESSAGES.values():
+        log_message(sink, sent)
+
+
+def _log_costmap(channels: MapSink, sent: MapToSend) -> None:
     """Without a band of heights there is no costmap."""
     options, up = sent.options, _up(sent.m, sent.options)
     if options.z_min is not None or options.z_max is not None:
         channels.costmap(_level(sent.decided, options, up), up[1] * (options.z_min or 0.0), sent.stamp_s)
 
 
-def _log_path(channels: MapChannels, sent: MapToSend) -> None:
+def _log_path(channels: MapSink, sent: MapToSend) -> None:
     if sent.poses:
         channels.path(sent.poses)
 
 
-def _log_surface(channels: MapChannels, sent: MapToSend) -> None:
+def _log_surface(channels: MapSink, sent: MapToSend) -> None:
     measured, threshold = _with_rays(sent.m, Path(SURFACE), sent.options), sent.options.threshold
     surface = smooth_surface(sent.m, threshold) if measured is None else measured_surface(measured)
     channels.surface(surface, sent.stamp_s)
 
 
-MESSAGES: dict[str, Callable[[MapChannels, MapToSend], None]] = {
-    CLOUD: lambda to, sent: to.voxels(*_points(sent.decided, Path(CLOUD), sent.options), sent.stamp_s),
+MESSAGES: dict[str, Callable[[MapSink, MapToSend], None]] = {
+    CLOUD: lambda to, sent: to.voxels(_points(sent.decided, Path(CLOUD), sent.options), sent.stamp_s),
     OCTOMAP: lambda to, sent: to.octomap(sent.decided, sent.options.cells, sent.stamp_s),
     COSTMAP: _log_costmap,
     PATH: _log_path,
@@ -328,6 +330,7 @@ _WRITERS: dict[str, Writer] = {
     ".pgm": _level_map,
     ".yaml": _level_map,
     ".mcap": _messages,
+    ".rrd": _recording,
     ".npz": _arrays,
     ".html": _page,
     SUFFIX: _chunks,

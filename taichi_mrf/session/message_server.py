@@ -1,4 +1,4 @@
-"""Serves a map's messages (export.robot_messages) to Foxglove and to robots while it is made: those that have
+"""Serves a map's messages (export.map_sink) to Foxglove and to robots while it is made: those that have
 changed, to those who have subscribed.
 
 What maps asks between two frames whether a message is due. A message costs nothing while nobody has
@@ -14,10 +14,13 @@ from types import TracebackType
 from typing import Any
 
 from taichi_mrf.config.arguments import ArgumentTypeError, shown
+from taichi_mrf.datasets.wires.rmw_zenoh import ZenohNode
 from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.export.formats import MESSAGES, MapToSend
+from taichi_mrf.export.map_sink import SURFACE, TRANSFORMS
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.export.robot_messages import SURFACE, TRANSFORMS, MapChannels, require_libraries
+from taichi_mrf.export.robot_messages import MapChannels, require_libraries
+from taichi_mrf.export.ros_messages import TYPES, RosMessages
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.libraries import library
@@ -53,32 +56,20 @@ class MessageServer:
         *,
         host: str = "127.0.0.1",
         port: int = PORT,
+        zenoh: str | None = None,
+        domain: int = 0,
         every_s: float = EVERY_S,
         options: ExportOptions | None = None,
     ) -> None:
-        """Listen; ``port`` 0 takes any. ``options`` are those of the messages in a file, with a costmap if
-        they have a band of heights. Raises TaichiMRFError without the extra ``robot``, and ConfigError if
-        nobody can listen there."""
-        require_libraries("messages for robots need")
-        foxglove = library("foxglove", "messages for robots need", "robot")
+        """Listen for Foxglove; ``port`` 0 takes any. Or publish over ``zenoh``, to who is at this address
+        (``tcp/host:port``; empty: on this machine), in the ROS_DOMAIN_ID ``domain``. ``options`` are those of
+        the messages in a file, with a costmap if they have a band of heights. Raises TaichiMRFError without
+        the extra ``robot``, and ConfigError if nobody can listen or be reached there."""
         self._options, self._every_s = options or ExportOptions(), every_s
         self._sent = {topic: _Sent() for topic in TOPICS}
         self._ended_s, self._took_s = -math.inf, 0.0  # the last message of all
-        context = foxglove.Context()
-        self._channels = MapChannels(context)
-        try:
-            self._server = foxglove.start_server(
-                name="taichi-mrf",
-                context=context,
-                host=host,
-                port=port,
-                server_listener=_Listener(self._came),
-            )
-        except (OverflowError, RuntimeError, ValueError) as error:
-            raise ConfigError(
-                f"no messages can be served at {host}:{port} ({said(error)}): name another port or host"
-            ) from error
-        self.address = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
+        wire = _Foxglove(self._came, host, port) if zenoh is None else _Zenoh(self._came, zenoh, domain)
+        self._wire, self._channels, self.address = wire, wire.channels, wire.address
 
     def due_in(self, m: OccupancyMap, at_rest: bool) -> float | None:
         """Seconds until a message is due, 0 if one is; None if nobody waits for any."""
@@ -116,9 +107,9 @@ class MessageServer:
 
     def close(self) -> None:
         """End, once those who have subscribed have had time to receive the last messages."""
-        if any(map(self._channels.are_wanted, TOPICS)):
+        if any(map(self._wire.are_wanted, TOPICS)):
             time.sleep(max(0.0, self._ended_s + LINGER_S - time.monotonic()))
-        self._server.stop()
+        self._wire.stop()
 
     def _waits(self, m: OccupancyMap, at_rest: bool) -> list[tuple[float, str]]:
         """Seconds until a topic's message may be sent, for each topic that lacks one."""
@@ -128,7 +119,7 @@ class MessageServer:
         free_s = self._ended_s + (0.0 if at_rest else self._took_s * (1 / SHARE - 1))
         for topic, sent in self._sent.items():
             owed = sent.state != state and (at_rest or topic != SURFACE)
-            if owed and self._channels.are_wanted(topic):
+            if owed and self._wire.are_wanted(topic):
                 found.append((max(0.0, free_s - now_s, sent.begun_s + self._every_s - now_s), topic))
         return found
 
@@ -174,12 +165,14 @@ class Published:
 
 
 def publish(m: OccupancyMap, options: ExportOptions | None = None, **where: Any) -> Published:
-    """Serve a map to Foxglove and to robots while the caller's own loop makes it.
+    """Serve a map to Foxglove or to a robot while the caller's own loop makes it.
 
     ``options`` are those of :func:`export_map`; a band of heights, ``ExportOptions(z_min=0.1, z_max=1.5)``,
-    adds a costmap. ``where``: ``port`` (8765, 0 for any), ``host`` (127.0.0.1), ``every_s``, the shortest
-    time between two messages of a topic (1 s). Raises ArgumentTypeError if ``m`` takes no keyframes,
-    ConfigError if the port is taken, and TaichiMRFError without the extra ``robot``. Example::
+    adds a costmap. ``where``: ``port`` (8765, 0 for any) and ``host`` (127.0.0.1) for Foxglove, or ``zenoh``,
+    the address of a robot's router (``tcp/robot:7447``, ``""`` on this machine), with its ``domain``, for
+    ROS 2's nodes; ``every_s``, the shortest time between two messages of a topic (1 s). Raises
+    ArgumentTypeError if ``m`` takes no keyframes, ConfigError if the port is taken or nobody answers, and
+    TaichiMRFError without the extra ``robot``. Example::
 
         with tm.publish(m, port=8765) as served:
             for depth_m, T_world_camera in camera:
@@ -191,6 +184,37 @@ def publish(m: OccupancyMap, options: ExportOptions | None = None, **where: Any)
 
 def _state(m: OccupancyMap, at_rest: bool) -> Hashable:
     return m.view.pool.revision, m.settled, len(m.keyframes), at_rest
+
+
+class _Foxglove:
+    """Foxglove's own server."""
+
+    def __init__(self, came: Callable[[str], None], host: str, port: int) -> None:
+        require_libraries("messages for robots need")
+        foxglove = library("foxglove", "messages for robots need", "robot")
+        context = foxglove.Context()
+        self.channels = MapChannels(context)
+        self.are_wanted = self.channels.are_wanted
+        try:
+            server = foxglove.start_server(
+                name="taichi-mrf", context=context, host=host, port=port, server_listener=_Listener(came)
+            )
+        except (OverflowError, RuntimeError, ValueError) as error:
+            raise ConfigError(
+                f"no messages can be served at {host}:{port} ({said(error)}): name another port or host"
+            ) from error
+        self.stop, self.address = server.stop, f"ws://{f'[{host}]' if ':' in host else host}:{server.port}"
+
+
+class _Zenoh:
+    """A node of ROS 2 over Zenoh."""
+
+    def __init__(self, came: Callable[[str], None], address: str, domain: int) -> None:
+        messages = RosMessages(lambda topic, content, _: node.send(topic, content))
+        types = {topic: (name, messages.type_hash(topic)) for topic, name in TYPES.items()}
+        node = ZenohNode(address, domain, types, came)
+        self.channels = messages
+        self.are_wanted, self.stop, self.address = node.are_wanted, node.close, node.source
 
 
 class _Listener:

@@ -129,7 +129,7 @@ def test_a_post_thinner_than_a_voxel_is_sent_while_frames_come(monkeypatch: pyte
     m, sent = MRFMap(0.05, PolynomialNoise(sigma=(0.004,))), []
     with tm.publish(m, port=0, every_s=0.0) as served:
         channels = served._server._channels
-        monkeypatch.setattr(channels, "voxels", lambda centres_m, *_: sent.append(centres_m))
+        monkeypatch.setattr(channels, "voxels", lambda points, _: sent.append(points.centres_m))
         with client_of(served.address, "/map/voxels"):
             assert wait_until(lambda: channels.are_wanted("/map/voxels"), DEADLINE_S)
             for x_m in np.linspace(-0.4, 0.4, 10):

@@ -34,6 +34,7 @@ COMMANDS = {
     "ouster": ("ouster.sdk", ["map", "drive.osf", "--out", "out"]),
     "realsense": ("pyrealsense2", ["map", "realsense:", "--out", "out"]),
     "record3d": ("lzfse", ["map", "walk", "--out", "out"]),
+    "rerun": ("rerun", ["export", "no-such-map.npz", "--to", "folder/map.rrd"]),
     "robot": ("yourdfpy", ["map", ROOM, "--robot", "arm.urdf", "--camera-link", "eye", "--out", "out"]),
     "ros": ("rosbags.highlevel", ["map", "drive.bag", "--out", "out"]),
     "store": ("zarr", ["map", ROOM, "--submap-size", "5", "--out", "out"]),
@@ -41,7 +42,7 @@ COMMANDS = {
 """Extra -> a module of it, and a command that cannot do without."""
 
 MESH = "trimesh", "mesh"
-EXPORTS = {"glb": MESH, "stl": MESH, "obj": MESH, "mcap": ("foxglove", "robot")}
+EXPORTS = {"glb": MESH, "stl": MESH, "obj": MESH, "mcap": ("foxglove", "robot"), "rrd": ("rerun", "rerun")}
 
 
 @pytest.fixture(autouse=True)
@@ -95,7 +96,8 @@ def test_an_export_says_which_extra_it_needs(
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "extra"), [("a.zarr", "zarr", "store"), ("a.glb", "trimesh", "mesh")]
+    ("name", "module", "extra"),
+    [("a.zarr", "zarr", "store"), ("a.glb", "trimesh", "mesh"), ("a.rrd", "rerun", "rerun")],
 )
 def test_an_export_asks_for_its_extra_before_it_reads_the_map(
     name: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -1,4 +1,5 @@
-"""ROS 2 over Zenoh, as its middleware ``rmw_zenoh`` lays topics out: a client that only listens.
+"""ROS 2 over Zenoh, as its middleware ``rmw_zenoh`` lays topics out: a client that listens, and a node that
+publishes.
 
 Publishers (MP) and subscribers (MS) declare liveliness tokens, whose parts are, with % for each / within one,
 ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/MP/ENCLAVE/NAMESPACE/NODE_NAME/TOPIC/TYPE/TYPE_HASH/QOS``. Messages have
@@ -16,14 +17,16 @@ threads of its own, and makes a connection that is lost again.
 import json
 import struct
 import time
-from collections.abc import Collection
+import uuid
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 from taichi_mrf.datasets.ros.decoding import CDR
 from taichi_mrf.datasets.ros.sources import Channel
 from taichi_mrf.datasets.wires.client import Client, wait_until
-from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError, said
 from taichi_mrf.system.libraries import library
 
 PORT = 7447
@@ -37,9 +40,15 @@ FIND_S = 3.0
 
 SETTLE_S = 0.3
 
-_TOKEN, _PUBLISHER, _TRANSIENT_LOCAL = "@ros2_lv", "MP", "1"
+HEARTBEAT_S = 0.5
+"""Seconds after which a subscriber notices that it missed the last message of a topic."""
+
+_TOKEN, _PUBLISHER, _SUBSCRIBER, _TRANSIENT_LOCAL = "@ros2_lv", "MP", "MS", "1"
 _NODE = "%/%/taichi_mrf"
-"""Enclave, namespace and name of the node that listens."""
+"""Enclave, namespace and name of the node that listens or publishes."""
+
+_KEPT_QOS = f":{_TRANSIENT_LOCAL}:,1:,:,:,,"
+"""Reliable, transient local, the last message: as ROS 2's own maps are published."""
 
 _ATTACHED = struct.Struct("<qqB16s")
 
@@ -70,15 +79,14 @@ class ZenohClient(Client):
         self._ext = library("zenoh.ext", f"{self.source} needs", "robot", DatasetError)
         self._publishers: dict[str, Publisher] = {}
         self._subscribed: dict[str, list[Any]] = {}
-        self._session = self._opened()
-        self._me = f"{_TOKEN}/{domain}/{self._session.info.zid()}/0"
+        self._session = _opened(self._zenoh, whole, self.source, DatasetError)
         try:
             self._session.liveliness().declare_subscriber(
                 f"{_TOKEN}/{domain}/**", self._take_in_token, history=True
             )
             if not wait_until(lambda: bool(self.channels), FIND_S):
                 raise DatasetError(f"{self.source}: {self._nobody()}")
-            self._node = self._session.liveliness().declare_token(f"{self._me}/0/NN/{_NODE}")
+            self._node = _declared(self._session, domain, 0, "NN")
         except BaseException:
             self.close()
             raise
@@ -108,48 +116,14 @@ class ZenohClient(Client):
             self._subscribed[topic] = [subscriber]
             if publisher is not None:  # nodes that publish only while somebody listens look for such a token
                 self._declared += 1
-                token = f"{self._me}/{self._declared}/MS/{_NODE}/{publisher.described}"
-                self._subscribed[topic].append(self._session.liveliness().declare_token(token))
+                self._subscribed[topic].append(
+                    _declared(self._session, self._domain, self._declared, _SUBSCRIBER, publisher.described)
+                )
 
     def close(self) -> None:
         """End the connection."""
         with suppress(self._zenoh.ZError):
             self._session.close()
-
-    def _opened(self) -> Any:
-        """The session. With an address it is a client, to whom a router sends on what all publish; without
-        one a peer as the robot's own nodes are, which opens no port to the network."""
-        settings: dict[str, Any] = {
-            "mode": "client",
-            "connect/endpoints": [self.address],
-            "connect/timeout_ms": round(CONNECT_S * 1000),
-            "connect/exit_on_failure": True,
-            "scouting/multicast/enabled": False,
-        }
-        if not self.address:
-            settings = {
-                "mode": "peer",
-                "connect/endpoints": [f"tcp/localhost:{PORT}"],
-                "connect/timeout_ms": 0,
-                "connect/exit_on_failure": False,
-                "listen/endpoints": ["tcp/localhost:0"],
-                "scouting/multicast/enabled": True,
-            }
-        config = self._zenoh.Config()
-        try:
-            for name, value in settings.items():
-                config.insert_json5(name, json.dumps(value))
-        except self._zenoh.ZError as error:
-            raise DatasetError(
-                f"{self.source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}"
-            ) from error
-        try:
-            return self._zenoh.open(config)
-        except self._zenoh.ZError as error:
-            raise DatasetError(
-                f"{self.source}: no answer within {CONNECT_S:g} s: is the robot on, in this network, its "
-                f"port open? '{ROUTER}' starts its router, on port {PORT} (Zenoh: {_first(error)})"
-            ) from error
 
     def _nobody(self) -> str:
         """Why there are no topics."""
@@ -195,10 +169,114 @@ class ZenohClient(Client):
                 )
 
 
-def publisher_of(token: str) -> Publisher | None:
-    """What a liveliness token says of a publisher, None if it is another entity's, or none."""
+class ZenohNode:
+    """A node that publishes, and keeps each topic's last message for who comes later. ``source`` names it."""
+
+    def __init__(
+        self, address: str, domain: int, types: Mapping[str, tuple[str, str]], came: Callable[[str], None]
+    ) -> None:
+        """Connect as ZenohClient does, and publish on the topics of ``types``: name (nav_msgs/msg/Path) and
+        hash of each one's type. ``came`` is told, from another thread, of each topic that somebody has
+        subscribed to. Raises ConfigError, which names the address, if nobody answers there, and if Zenoh is
+        not installed."""
+        whole = _whole(address)
+        self.source = f"zenoh:{whole}" + (f"?domain={domain}" if domain else "")
+        self._zenoh = library("zenoh", f"{self.source} needs", "robot", ConfigError)
+        ext = library("zenoh.ext", f"{self.source} needs", "robot", ConfigError)
+        self._session = _opened(self._zenoh, whole, self.source, ConfigError)
+        self._topics, self._came = set(types), came
+        self._listeners: dict[str, str] = {}
+        self._sent, self._publishers, self._tokens = Counter[str](), dict[str, Any](), []
+        self._gids = {topic: uuid.uuid4().bytes for topic in types}
+        self._tokens.append(_declared(self._session, domain, 0, "NN"))
+        for number, (topic, (name, type_hash)) in enumerate(types.items(), 1):
+            kind = _dds_type(name)
+            self._publishers[topic] = ext.declare_advanced_publisher(
+                self._session,
+                f"{domain}/{topic.strip('/')}/{kind}/{type_hash}",
+                cache=ext.CacheConfig(1),
+                publisher_detection=True,
+                sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=HEARTBEAT_S),
+                congestion_control=self._zenoh.CongestionControl.BLOCK,  # a cloud is many packets
+            )
+            described = f"{topic.replace('/', '%')}/{kind}/{type_hash}/{_KEPT_QOS}"
+            self._tokens.append(_declared(self._session, domain, number, _PUBLISHER, described))
+        self._session.liveliness().declare_subscriber(
+            f"{_TOKEN}/{domain}/**", self._take_in_token, history=True
+        )
+
+    def send(self, topic: str, content: bytes) -> None:
+        """Publish a message, in CDR with its encapsulation."""
+        self._sent[topic] += 1
+        attached = _ATTACHED.pack(self._sent[topic], time.time_ns(), 16, self._gids[topic])
+        self._publishers[topic].put(content, attachment=attached)
+
+    def are_wanted(self, topic: str) -> bool:
+        """True if somebody has subscribed to the topic."""
+        return topic in list(self._listeners.values())
+
+    def close(self) -> None:
+        """End the connection."""
+        with suppress(self._zenoh.ZError):
+            self._session.close()
+
+    def _take_in_token(self, sample: Any) -> None:
+        token = str(sample.key_expr)
+        listener = publisher_of(token, _SUBSCRIBER)
+        if listener is None or listener.channel.topic not in self._topics:
+            return
+        if sample.kind == self._zenoh.SampleKind.PUT:
+            self._listeners[token] = listener.channel.topic
+            self._came(listener.channel.topic)
+        else:
+            self._listeners.pop(token, None)
+
+
+def _opened(zenoh: Any, address: str, source: str, problem: type[TaichiMRFError]) -> Any:
+    """A session. With an address it is a client, for whom a router sends on what all publish; without one a
+    peer as the robot's own nodes are, which opens no port to the network. Raises ``problem``."""
+    settings: dict[str, Any] = {
+        "mode": "client",
+        "connect/endpoints": [address],
+        "connect/timeout_ms": round(CONNECT_S * 1000),
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
+    }
+    if not address:
+        settings = {
+            "mode": "peer",
+            "connect/endpoints": [f"tcp/localhost:{PORT}"],
+            "connect/timeout_ms": 0,
+            "connect/exit_on_failure": False,
+            "listen/endpoints": ["tcp/localhost:0"],
+            "scouting/multicast/enabled": True,
+        }
+    config = zenoh.Config()
+    try:
+        for name, value in {**settings, "timestamping/enabled": True}.items():  # which kept messages need
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        raise problem(f"{source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}") from error
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise problem(
+            f"{source}: no answer within {CONNECT_S:g} s: is the robot on, in this network, its "
+            f"port open? '{ROUTER}' starts its router, on port {PORT} (Zenoh: {_first(error)})"
+        ) from error
+
+
+def _declared(session: Any, domain: int, number: int, entity: str, described: str = "") -> Any:
+    """The liveliness token of the node (NN), or of its publisher or subscriber of a topic that is
+    ``described`` by the end of the token."""
+    parts = [_TOKEN, str(domain), str(session.info.zid()), "0", str(number), entity, _NODE, described]
+    return session.liveliness().declare_token("/".join(parts).rstrip("/"))
+
+
+def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
+    """What a liveliness token says of a publisher, or of another ``entity``; None if it is of none."""
     parts = token.split("/")
-    if len(parts) != 13 or parts[0] != _TOKEN or parts[5] != _PUBLISHER:
+    if len(parts) != 13 or parts[0] != _TOKEN or parts[5] != entity:
         return None
     topic, kind, _, qos = parts[9:]
     channel = Channel(topic.replace("%", "/"), _ros_type(kind), CDR)
@@ -218,6 +296,12 @@ def _ros_type(kind: str) -> str:
     """A type's name as ROS 2 writes it: sensor_msgs::msg::dds_::Image_ is sensor_msgs/msg/Image."""
     package, *between, name = kind.split("::")
     return "/".join([package, *(each for each in between if each != "dds_"), name.removesuffix("_")])
+
+
+def _dds_type(name: str) -> str:
+    """The inverse of :func:`_ros_type`."""
+    package, between, name = name.split("/")
+    return f"{package}::{between}::dds_::{name}_"
 
 
 def _first(error: Exception) -> str:
