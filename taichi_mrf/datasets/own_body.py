@@ -17,7 +17,7 @@ AnyBody = TypeVar("AnyBody", bound="OwnBody")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnBody:
-    """Where the robot itself is. What it covers counts as not measured, and never as without a return."""
+    """Where the robot itself is. What it covers is no measurement of the world, nor a missing one."""
 
     mask: str | None = field(default=None, metadata=_FILE)
     """An image of one channel (PNG), as large as a depth image is stored: 0 is the robot's own body, anything
