@@ -172,7 +172,7 @@ class Resampled(Derived):
             color = frame.color[self.rows, self.columns]
             color[outside] = 0
         sigma_m = None if frame.sigma_m is None else frame.sigma_m[self.rows, self.columns]
-        no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] & ~outside
+        no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] * ~outside
         return replace(
             frame,
             depth_m=depth_m,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from taichi_mrf.errors import ConfigError
 
@@ -17,11 +17,11 @@ AnyBody = TypeVar("AnyBody", bound="OwnBody")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnBody:
-    """Where the robot itself is. What it covers counts as not measured, and never as without a return."""
+    """Where the robot itself is. What it covers is no measurement of the world, nor a missing one."""
 
     mask: str | None = field(default=None, metadata=_FILE)
     """An image of one channel (PNG), as large as a depth image is stored: 0 is the robot's own body, anything
-    else the world."""
+    else the world. It has no depth: what it covers stays unknown."""
 
     body_box: tuple[Box, ...] = field(default=(), metadata={"metavar": "X0 Y0 Z0 X1 Y1 Z1"})
     """A box in the frame of the camera or lidar in metres, in which measurements are of the robot's own body;
@@ -40,6 +40,10 @@ class OwnBody:
 
     body_margin: float = 0.02
     """By how much the URDF's geometry is grown (metres)."""
+
+    body_space: Literal["free", "unknown"] = "free"
+    """What is known of the space of the URDF's geometry where pixels measure it (mrf only): that nothing else
+    is in it, or not even that."""
 
     def __post_init__(self) -> None:
         if (self.robot is None) != (self.camera_link is None) or (self.joints and self.robot is None):

@@ -114,7 +114,8 @@ class RobotModel:
             if name not in joints:
                 raise DatasetError(f"{body.joints}: {path} has no joint '{name}'; {nearest(name, joints)}")
         self._robot.update_cfg(dict(zip(self._joints.names, self._joints.positions[0].tolist(), strict=True)))
-        self._parts: dict[str, MeshScene] = {}
+        self._margin_m = body.body_margin
+        self._parts: dict[str, tuple[MeshScene, MeshScene | None]] = {}  # grown, and as it is if it is closed
         around: list[str] = []
         graph = self._robot.scene.graph
         for node in graph.nodes_geometry:
@@ -123,7 +124,8 @@ class RobotModel:
             if _is_around(mesh, inverse(self._T_camera_part(node))[:3, 3], body.body_margin):
                 around.append(str(node))
             else:
-                self._parts[node] = MeshScene(grown(mesh, body.body_margin))
+                solid = MeshScene(mesh) if body.body_space == "free" and geometry.is_watertight else None
+                self._parts[node] = MeshScene(grown(mesh, body.body_margin)), solid
         if not self._parts:
             raise DatasetError(f"{path}: has no geometry but what is around {self._link}")
         self.note = f"own body: {len(self._parts)} parts of {path}, grown by {body.body_margin:g} m"
@@ -133,16 +135,24 @@ class RobotModel:
         T: Pose = np.array(self._robot.get_transform(node, self._link), np.float64)
         return T
 
-    def covered(self, frame: Frame) -> NDArray[np.bool_]:
+    def covered(self, frame: Frame) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """The pixels (H, W) of a frame whose ray meets the grown body, but for those that measure something
-        in front of it. Raises FrameError if the joints' positions are not known then."""
+        in front of it; and the depth at which those that measure it leave the first closed part, less the
+        margin, 0 where they meet none. Raises FrameError if the joints' positions are not known then."""
         self._robot.update_cfg(self._joints.at(frame))
         depth_m = axial_depth(frame.depth_m, frame.camera, self._conventions)
-        covered = np.zeros(depth_m.shape, bool)
-        for node, part in self._parts.items():
-            hit = part.render_depth(frame.camera, inverse(self._T_camera_part(node)))
+        covered, free_m = np.zeros(depth_m.shape, bool), np.zeros(depth_m.shape, np.float32)
+        nearest_m = np.full(depth_m.shape, np.inf, np.float32)
+        for node, (around, solid) in self._parts.items():
+            T_part_camera = inverse(self._T_camera_part(node))
+            hit = around.render_depth(frame.camera, T_part_camera)
             covered |= (hit > 0) & ((depth_m >= hit) | (depth_m <= 0))
-        return covered
+            if solid is not None and hit.any():
+                enter = solid.render_depth(frame.camera, T_part_camera)
+                leave = solid.render_depth(frame.camera, T_part_camera, enter + np.float32(1e-4))
+                nearer = (leave > 0) & (enter < nearest_m)
+                nearest_m[nearer], free_m[nearer] = enter[nearer], leave[nearer]
+        return covered, np.maximum(free_m - np.float32(self._margin_m), 0) * (covered & (depth_m > 0))
 
 
 def _mesh_file(urdf: Path, fname: str) -> str:

@@ -20,10 +20,13 @@ from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, naming
 from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.own_evidence import free_up_to_m
 from taichi_mrf.system.files import read_bytes
 
-Covered = Callable[[Frame], NDArray[np.bool_]]
-"""Which pixels of a frame the body covers, (H, W)."""
+Body = tuple[NDArray[np.bool_], NDArray[np.float32]]
+"""Which pixels (H, W) of a frame the body covers, and up to which depth nothing else is there; 0: unknown."""
+
+Covered = Callable[[Frame], Body]
 
 _MASK = "a mask is drawn over a depth image as it is stored, before --image-is, --undistort and --image-scale"
 
@@ -38,8 +41,11 @@ class WithoutBody(Derived):
         """Read the source's frame. Raises what the source raises, and FrameError for images of another size
         than the mask's."""
         frame = self.source.read(index)
-        covered = self.covered(frame)
-        no_return = None if frame.no_return is None else frame.no_return & ~covered
+        covered, free_m = self.covered(frame)
+        no_return = None if frame.no_return is None else frame.no_return * ~covered
+        if free_m.any():
+            others = np.zeros_like(free_m) if no_return is None else free_up_to_m(no_return)
+            no_return = np.where(free_m > 0, free_m, others)
         depth_m = np.where(covered, np.float32(0), frame.depth_m)
         return replace(frame, depth_m=depth_m, no_return=no_return)
 
@@ -98,18 +104,18 @@ def _without(dataset: Dataset, covered: Covered, note: str) -> WithoutBody:
     )
 
 
-def _in_mask(body: NDArray[np.bool_], path: Path, frame: Frame) -> NDArray[np.bool_]:
+def _in_mask(body: NDArray[np.bool_], path: Path, frame: Frame) -> Body:
     if frame.depth_m.shape != body.shape:
         (rows, columns), (height, width) = frame.depth_m.shape, body.shape
         raise FrameError(
             f"frame {frame.name}: has {columns} x {rows} pixels, the mask {path} {width} x {height}; {_MASK}"
         )
-    return body
+    return body, np.zeros(body.shape, np.float32)
 
 
-def _in_boxes(boxes: NDArray[np.float64], conventions: Conventions, frame: Frame) -> NDArray[np.bool_]:
+def _in_boxes(boxes: NDArray[np.float64], conventions: Conventions, frame: Frame) -> Body:
     depth_m = axial_depth(frame.depth_m, frame.camera, conventions)
     points = replace(frame, depth_m=depth_m).points_m[..., None, :]
     inside = ((points >= boxes[:, 0]) & (points <= boxes[:, 1])).all(axis=-1).any(axis=-1)
     covered: NDArray[np.bool_] = inside & (depth_m > 0)
-    return covered
+    return covered, np.zeros(covered.shape, np.float32)

@@ -4,6 +4,7 @@ Bricks are allocated near measured surfaces only (section IV-B). The bricks in f
 they separate seen-free from unknown space, and give the bricks of other keyframes that the rays cross.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ def find_footprint(
     volume: VolumeConfig,
     end_sigmas: float = END_SIGMAS,
     beyond_m: float = 0.0,
-    no_returns: NoReturnRays | None = None,
+    no_returns: Sequence[NoReturnRays] = (),
 ) -> Footprint:
     """Follow every ray of an image's list from the camera to its end, which the list's maker put
     ``end_sigmas`` beyond its measurement, and ``beyond_m`` metres of axial depth more; in front of all
@@ -48,11 +49,11 @@ def find_footprint(
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
     """
     lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, end_sigmas, beyond_m)
-    if no_returns is not None:
-        end = visible_box(no_returns.image, T_world_camera, no_returns.reach_m, end_sigmas)
+    for each in no_returns:
+        end = visible_box(each.image, T_world_camera, each.reach_m, end_sigmas)
         lower_m, upper_m = np.minimum(lower_m, end[0]), np.maximum(upper_m, end[1])
     window = window_around(lower_m, upper_m, voxel_size, volume)
-    if (image.rays == 0 and no_returns is None) or window is None:
+    if (image.rays == 0 and not no_returns) or window is None:
         nowhere = Window.covering(T_world_camera[:3, 3], T_world_camera[:3, 3], voxel_size)
         return Footprint(nowhere, np.zeros(0, np.int32), np.zeros(0, np.int32), 1)
     box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
@@ -64,9 +65,9 @@ def find_footprint(
         _Marks(window.shape_vector, box_lower, box_upper, marks, longest),
     )
     _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m), seen)
-    if no_returns is not None:
-        reach = _Reach(sensor.min_depth, no_returns.reach_m, end_sigmas, 0.0)
-        _mark(no_returns.ray_list, no_returns.image.sensor, view, reach, seen)
+    for each in no_returns:
+        reach = _Reach(each.begin_m, each.reach_m, end_sigmas, 0.0)
+        _mark(each.ray_list, each.image.sensor, view, reach, seen)
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]
     _check_size(len(crossed), len(surface), voxel_size, volume.memory_limit_gb)
@@ -188,7 +189,7 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
         for i in range(rays.first[group], rays.first[group + 1]):
             measured = rays.depth[i]
             ray, noise, _ = listed_ray(rays, i, sensor, view)
-            last = rays.last[i] + reach.beyond_m
+            last = sensor.until(measured, rays.last[i] + reach.beyond_m)
             begin, end = apart, ti.min(last, reach.max_depth)
             clip(ray, begin, end, marks.lower, marks.upper)
             if end > reach.min_depth:

@@ -207,8 +207,8 @@ class RayList(Bundle):
 
 @dataclass
 class NoReturnRays:
-    """The rays of the pixels that got no return. The depth of their ``image`` is that up to which they count,
-    ``reach_m``, and ``begin_m`` that from which on they do (sensor/no_return.py)."""
+    """The rays of pixels that got no return, of one law (sensor/no_return.py). The depth of their ``image``
+    is that up to which they count, at most ``reach_m``, and ``begin_m`` that from which on they do."""
 
     image: DepthImage
     ray_list: RayList
@@ -292,7 +292,7 @@ class Keyframe:
     messages: ti.Ndarray | None = None
     change_count_at_last_sweep: NDArray[np.int64] | None = None
     pending_visible: VisibleBricks | None = None
-    no_returns: NoReturnRays | None = None
+    no_returns: tuple[NoReturnRays, ...] = ()
     withdrawn: bool = False
 
     @property
@@ -323,8 +323,7 @@ class Keyframe:
     @property
     def image_bytes(self) -> int:
         """Bytes of the images and of the lists of the rays."""
-        no_returns = 0 if self.no_returns is None else self.no_returns.nbytes
-        return self.image.nbytes + self.ray_list.nbytes + no_returns
+        return self.image.nbytes + self.ray_list.nbytes + sum(each.nbytes for each in self.no_returns)
 
     @property
     def voxel_bytes(self) -> int:

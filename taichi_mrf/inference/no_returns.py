@@ -1,5 +1,6 @@
 """The rays of pixels that got no return: which they are, and what they tell voxels."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,27 +15,31 @@ from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, I64Array
 from taichi_mrf.sensor.no_return import NoReturnLaw
+from taichi_mrf.sensor.own_evidence import free_up_to_m
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Space, Viewpoint
 
 
-def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler) -> NoReturnRays | None:
-    """The rays of the pixels of an image that got no return; None if there are none, or they do not count.
+def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler) -> tuple[NoReturnRays, ...]:
+    """The rays of the pixels of an image that got no return: those that say up to which depth, and those of
+    the configuration's law, if they count.
 
     They are bundled as if all had measured the depth up to which they count: there a voxel covers the fewest
     pixels.
     """
-    law = NoReturnLaw.of(config)
-    if law is None or image.own.no_return is None:
-        return None
-    depth = np.where(image.own.no_return, np.float32(law.reach_m), np.float32(0.0))
-    without = DepthImage.upload(depth, image.camera, law)
-    rays = bundler.rays_of(without)
-    return NoReturnRays(without, rays, law.begin_m, law.reach_m)
+    assert image.own.no_return is not None
+    free_m, found = free_up_to_m(image.own.no_return), list[NoReturnRays]()
+    laws = (NoReturnLaw.sure(config), free_m), (NoReturnLaw.of(config), np.where(free_m < 0, np.inf, 0))
+    for law, until_m in laws:
+        if law is not None and (until_m > 0).any():
+            depth = np.clip(until_m, 0, law.reach_m).astype(np.float32)
+            without = DepthImage.upload(depth, image.camera, law)
+            found.append(NoReturnRays(without, bundler.rays_of(without), law.begin_m, law.reach_m))
+    return tuple(found)
 
 
 def send_no_returns(
-    no_returns: NoReturnRays, sums: "ti.Ndarray", view: Viewpoint, space: Space,
+    no_returns: Sequence[NoReturnRays], sums: "ti.Ndarray", view: Viewpoint, space: Space,
     model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers,
 ) -> None:  # fmt: skip
     """Sum up the messages of rays without a return in ``sums``, as measured ones are in ``swept.sums``.
@@ -43,12 +48,13 @@ def send_no_returns(
     added.
     """
     sums.fill(0)
-    sum_product.send_messages(
-        no_returns.ray_list, no_returns.begin_m, no_returns.image.sensor, view, space,
-        replace(model, max_depth=no_returns.reach_m, floor=0.0),
-        replace(swept, sums=sums),
-        trace, workers,
-    )  # fmt: skip
+    for each in no_returns:
+        sum_product.send_messages(
+            each.ray_list, each.begin_m, each.image.sensor, view, space,
+            replace(model, max_depth=each.reach_m, floor=0.0),
+            replace(swept, sums=sums),
+            trace, workers,
+        )  # fmt: skip
 
 
 @kernel

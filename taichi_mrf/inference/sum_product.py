@@ -151,7 +151,7 @@ def send_messages(
 
                     # The ray ends where its measurement carries no more evidence, or where the map ends.
                     last = rays.last[i]
-                    begin, end = apart, ti.min(last, model.max_depth)
+                    begin, end = apart, ti.min(sensor.until(measured, last), model.max_depth)
                     clip(ray, begin, end, space.lower, space.upper)
 
                     # Step 4, forward, eqs. 4 and 11, from the camera outwards:

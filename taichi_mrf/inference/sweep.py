@@ -120,14 +120,14 @@ class Sweeper:
         # Step 3, cavity, eq. 6: log-odds(m) = belief - own message, of each voxel.
         with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
             # Step 4, forward, eqs. 4 and 11, and step 5, backward, eqs. 13 and 14: each ray's messages.
-            if keyframe.no_returns is not None:
+            if keyframe.no_returns:
                 parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers)
                 no_returns.send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
             sum_product.send_messages(
                 keyframe.ray_list, 0.0, keyframe.image.sensor,
                 cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
             )  # fmt: skip
-            if keyframe.no_returns is not None:
+            if keyframe.no_returns:
                 no_returns.take_where_unmeasured(
                     len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
                     cast.swept.scale, limits.length,
@@ -203,9 +203,9 @@ class Sweeper:
         """The accumulators' scale, which follows from where the keyframe stands and from its bricks."""
         visible, image, window = keyframe.visible, keyframe.image, keyframe.footprint.window
         if visible.scale == 0.0:
-            rays, widest, no_returns = image.rays, keyframe.ray_list.widest, keyframe.no_returns
-            if no_returns is not None:
-                rays, widest = rays + no_returns.image.rays, max(widest, no_returns.ray_list.widest)
+            rays, widest = image.rays, keyframe.ray_list.widest
+            for each in keyframe.no_returns:
+                rays, widest = rays + each.image.rays, max(widest, each.ray_list.widest)
             bricks = window.bricks_of(visible.cells)
             visible.scale = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
         return visible.scale

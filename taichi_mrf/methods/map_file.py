@@ -323,7 +323,7 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
         sigma_m = file.array(f"{prefix}sigma_m", "f", camera.shape).astype(np.float32)
     no_return = None
     if f"{prefix}no_return" in file:
-        no_return = file.array(f"{prefix}no_return", "b", camera.shape)
+        no_return = file.array(f"{prefix}no_return", "bf", camera.shape)
     covariance = None
     if f"{prefix}pose_covariance" in file:
         with file.values_of(f"{prefix}pose_covariance"):

@@ -130,7 +130,7 @@ class OccupancyMap(VoxelMap, Protocol):
         default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
         maps that have colours (``METHOD.has_colors``); others raise ConfigError. ``noise`` is the keyframe's
         own noise model, ``sigma_m`` (H, W) its own standard deviation of each pixel's depth in metres (0 and
-        NaN: the noise model's), ``no_return`` (H, W) bool the pixels without a return, used according to
+        NaN: the noise model's), ``no_return`` (H, W) pixels without a return (NoReturn), used according to
         ``sensor.no_return`` in maps that support it, ``pose_covariance`` (6, 6) the uncertainty of the pose
         (MRFMap.add_keyframe)."""
         ...

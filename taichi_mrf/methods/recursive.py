@@ -46,7 +46,7 @@ from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
-from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
+from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return, free_up_to_m
 from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_npz
@@ -173,6 +173,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         missing = checked_no_return(no_return, depth_m, camera)
+        if missing is not None:  # those that are free up to a depth of their own are for an MRFMap
+            missing = without if (without := free_up_to_m(missing) < 0).any() else None
         if self._takes_no_return:
             own = dataclasses.replace(own, no_return=missing)
         elif missing is not None and self.sensor.no_return != "ignore":

@@ -11,7 +11,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import widened_noise
 from taichi_mrf.sensor.origins import points_at
-from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.sensor.own_evidence import NoReturn, OwnEvidence, checked_no_return
 from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
 
 if TYPE_CHECKING:
@@ -30,10 +30,10 @@ class Frame:
 
     The other fields are None if the sensor's configuration holds for the frame: ``sigma_m``, (H, W) float32,
     the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
-    ``no_return``, (H, W) bool, the pixels without a return; ``origin_m``, where the world's origin lies in
-    the recorded world if it was moved (Dataset.origin_m). ``sensor`` names the sensor in a recording of
-    several. ``gyro`` holds the camera's angular rates since the previous frame or longer, ``acceleration``
-    its accelerations since the last but one.
+    ``no_return``, the pixels without a return (own_evidence.NoReturn); ``origin_m``, where the world's origin
+    lies in the recorded world if it was moved (Dataset.origin_m). ``sensor`` names the sensor in a recording
+    of several. ``gyro`` holds the camera's angular rates since the previous frame or longer,
+    ``acceleration`` its accelerations since the last but one.
     """
 
     depth_m: NDArray[np.float32]
@@ -44,7 +44,7 @@ class Frame:
     color: NDArray[np.uint8] | None = None
     sigma_m: NDArray[np.float32] | None = None
     noise: "NoiseModel | None" = None
-    no_return: NDArray[np.bool_] | None = None
+    no_return: NoReturn | None = None
     sensor: str = ""
     gyro: "GyroSamples | None" = None
     acceleration: "AccelerationSamples | None" = None
@@ -64,7 +64,8 @@ class Frame:
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:
         """The part of :attr:`own` that a map with this configuration uses."""
         sigma_m = self._widened_sigma(sensor) if sensor.pixel_sigma else None
-        no_return = self.no_return if sensor.no_return != "ignore" else None
+        counts = sensor.no_return != "ignore"
+        no_return = checked_no_return(self.no_return, self.depth_m, self.camera, counts)
         noise = None if self.noise is None else widened_noise(self.noise, sensor)
         return OwnEvidence(noise, sigma_m, no_return)
 

@@ -76,6 +76,11 @@ class Sensor(Bundle):
         return depth_of_deviation(measured, -sigmas, noise)
 
     @ti.func
+    def until(self, measured: F32, last: F32):
+        """Where the ray of a measurement stops of which ``last`` is the end of its evidence."""
+        return last
+
+    @ti.func
     def support(self, measured: F32, noise: Template):
         """The depth before which no surface can give this measurement."""
         return depth_of_deviation(measured, SUPPORT, noise)

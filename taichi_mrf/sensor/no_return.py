@@ -67,6 +67,12 @@ class NoReturnLaw:
         reach = min(reach, config.max_depth)
         return NoReturnLaw(share, depth, width, config.min_depth, reach) if reach > config.min_depth else None
 
+    @staticmethod
+    def sure(config: SensorConfig) -> "NoReturnLaw":
+        """The law of pixels that are known to be free up to a depth of their own: a surface before it would
+        have been seen."""
+        return NoReturnLaw(0.0, _BEYOND_ALL_M, 1.0, 0.0, config.max_depth)
+
     def chance(self, depth_m: ArrayLike) -> NDArray[np.float64]:
         """q at depths in metres."""
         return no_return_chance(depth_m, self.share, self.depth_m, self.width_m)

@@ -56,8 +56,13 @@ class NoReturnSensor(Sensor):
 
     @ti.func
     def farthest_depth(self, measured: F32, noise: Template, sigmas: F32):
-        """The ray goes on to the end of the map, behind which there may be nothing."""
+        """A surface behind all that is looked at may have been met."""
         return ENDLESS
+
+    @ti.func
+    def until(self, measured: F32, last: F32):
+        """The depth up to which nothing came back."""
+        return measured
 
     @ti.func
     def support(self, measured: F32, noise: Template):

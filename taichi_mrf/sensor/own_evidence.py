@@ -15,6 +15,15 @@ from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.pixel_sigma import PixelSigma
 from taichi_mrf.sensor.pose_doubt import Covariance, DoubtfulPose, checked_covariance
 
+NoReturn = NDArray[np.bool_] | NDArray[np.float32]
+"""The pixels (H, W) that got no return from the world: bool; or float32, the depth in metres up to which
+nothing of it is on the ray, -1 where the configuration says how far that is, and 0 for all others."""
+
+
+def free_up_to_m(no_return: NoReturn) -> NDArray[np.float32]:
+    """Pixels without a return as float32."""
+    return -no_return.astype(np.float32) if no_return.dtype == np.bool_ else no_return.astype(np.float32)
+
 
 @dataclass(frozen=True)
 class OwnEvidence:
@@ -23,13 +32,13 @@ class OwnEvidence:
     if it is taken as exact.
 
     ``sigma_m`` is (H, W) float32, the standard deviation of each pixel's depth in metres; 0 stands for that
-    of the noise model. ``no_return`` is (H, W) bool. ``pose_covariance`` is (6, 6), of a twist in the
+    of the noise model. ``no_return`` is a :data:`NoReturn`. ``pose_covariance`` is (6, 6), of a twist in the
     camera's frame (pose_doubt.py).
     """
 
     noise: NoiseModel | None = None
     sigma_m: NDArray[np.float32] | None = None
-    no_return: NDArray[np.bool_] | None = None
+    no_return: NoReturn | None = None
     pose_covariance: Covariance | None = None
 
     def noise_model(self, default: NoiseModel, depth_m: NDArray[np.floating]) -> NoiseModel:
@@ -96,19 +105,20 @@ def checked_evidence(
 
 
 def checked_no_return(
-    no_return: ArrayLike | None, depth_m: ArrayLike, camera: Camera
-) -> NDArray[np.bool_] | None:
-    """A copy of (H, W) bool, the pixels that got no return, without those that hold a depth in the image as
-    it was given: a return from too near is a return. None for None, and if there are none. Raises
-    KeyframeError for a wrong shape or type."""
+    no_return: ArrayLike | None, depth_m: ArrayLike, camera: Camera, counts: bool = True
+) -> NoReturn | None:
+    """A copy of the pixels that got no return, without those that hold a depth in the image as it was given:
+    a return from too near is a return. None for None, and if there are none; those of -1 or True must count.
+    Raises KeyframeError for a wrong shape or type."""
     if no_return is None:
         return None
     given, depth = np.asarray(no_return), np.asarray(depth_m)
-    if given.shape != camera.shape or given.dtype != np.bool_:
+    if given.shape != camera.shape or given.dtype not in (np.bool_, np.float32):
         raise KeyframeError(
-            f"no_return must be bool of the shape {camera.shape}, not {given.dtype} {given.shape}"
+            f"no_return must be bool or float32 of the shape {camera.shape}, not {given.dtype} {given.shape}"
         )
-    without = given & ~(np.isfinite(depth) & (depth > 0))
+    kept = np.isfinite(given) & ~(np.isfinite(depth) & (depth > 0)) & (counts | (free_up_to_m(given) > 0))
+    without: NoReturn = np.where(kept, given, given.dtype.type(0))
     return without if without.any() else None
 
 

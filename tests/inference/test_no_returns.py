@@ -303,7 +303,9 @@ def test_dated_maps_take_them() -> None:
 def test_a_wrong_image_is_refused_and_a_return_counts_as_one() -> None:
     m, frame = in_room(), small_room.frames()[0]
     parts = (frame.depth_m, frame.T_world_camera, frame.camera)
-    with pytest.raises(KeyframeError, match=r"no_return must be bool of the shape \(90, 120\), not float64"):
+    with pytest.raises(
+        KeyframeError, match=r"no_return must be bool or float32 of the shape \(90, 120\), not float64"
+    ):
         m.add_keyframe(*parts, no_return=np.zeros(frame.camera.shape))
     with pytest.raises(KeyframeError, match=r"not bool \(3,\)"):
         m.add_keyframe(*parts, no_return=np.zeros(3, bool))

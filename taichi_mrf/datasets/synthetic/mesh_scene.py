@@ -72,9 +72,11 @@ class MeshScene:
         self._construction.TriangleMesh(tree, vertices, np.ascontiguousarray(self.mesh.triangles, np.int32))
         return tree
 
-    def render_depth(self, camera: Camera, T_world_camera: Pose) -> NDArray[np.float32]:
+    def render_depth(
+        self, camera: Camera, T_world_camera: Pose, beyond_m: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
         """Depth, (H, W) float32 in metres (axial for a pinhole), of the first triangle on the ray through
-        each pixel's centre, seen from either side; 0 where a ray meets none."""
+        each pixel's centre, from either side, beyond the depths (H, W) if given; 0 where it meets none."""
         if not len(self.mesh.triangles):
             return np.zeros(camera.shape, np.float32)
         rays = camera.rays()
@@ -84,11 +86,14 @@ class MeshScene:
         if starts is not None:
             turned = np.broadcast_to(starts, rays.shape).reshape(-1, 3) @ T_world_camera[:3, :3].T
             origins += turned.astype(np.float32)
-        depth_m = np.zeros(len(directions), np.float32)
+        depth_m, begin = np.zeros((2, len(directions)), np.float32)
+        if beyond_m is not None:
+            begin[:] = beyond_m.reshape(-1)
+            origins += begin[:, None] * directions
         near = self._near(origins, directions)
         # Directions are one metre of depth long, so that is what Embree's ray parameter is.
         hit = self._tree.run(origins[near], directions[near], query="INTERSECT", output=True)
-        depth_m[near] = np.where(hit["primID"] >= 0, hit["tfar"], np.float32(0))
+        depth_m[near] = np.where(hit["primID"] >= 0, begin[near] + hit["tfar"], np.float32(0))
         return depth_m.reshape(camera.shape)
 
     def _near(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int64]:

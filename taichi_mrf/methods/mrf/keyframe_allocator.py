@@ -45,7 +45,7 @@ class KeyframeAllocator:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
         CapacityError if there is not enough memory."""
         # A ray stands for each block of pixels that say the same: one factor psi_r each, eq. 4.
-        rays, without = self.bundler.rays_of(image), None
+        rays, without = self.bundler.rays_of(image), tuple[NoReturnRays, ...]()
         if image.own.no_return is not None:
             without = no_returns.no_return_rays(image, self.sensor, self.bundler)
         return self._placed(id, name, image, rays, T_world_camera, stamp_s, without)
@@ -60,13 +60,13 @@ class KeyframeAllocator:
 
     def _placed(
         self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, stamp_s: float,
-        no_returns: NoReturnRays | None,
+        no_returns: tuple[NoReturnRays, ...],
     ) -> Keyframe:  # fmt: skip
         """Find the footprint of rays and claim it, if there is enough memory."""
         # The voxels o_1 .. o_N of each ray lie in the bricks that it crosses up to 3 sigma behind d_r.
         parts = (self.registry.voxel_size, self.sensor, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, no_returns=no_returns)
-        of_no_returns = 0 if no_returns is None else no_returns.nbytes
+        of_no_returns = sum(each.nbytes for each in no_returns)
         self.budget.check(footprint, image.nbytes + rays.nbytes + of_no_returns)
         self.registry.anchor_at(T_world_camera[:3, 3])
         return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint, no_returns)
@@ -79,7 +79,7 @@ class KeyframeAllocator:
 
     def _claimed(
         self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, stamp_s: float,
-        footprint: Footprint, no_returns: NoReturnRays | None,
+        footprint: Footprint, no_returns: tuple[NoReturnRays, ...],
     ) -> Keyframe:  # fmt: skip
         """Claim the bricks and return the keyframe, counted in the budget."""
         self.registry.claim(footprint)

@@ -147,12 +147,12 @@ class MRFMap(BrickMap):
         keyframes added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from
         which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
         deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
-        for the model's, and an infinite one means no measurement; ``no_return`` is (H, W) bool, the pixels
-        without a return, used according to ``sensor.no_return``; ``pose_covariance`` is (6, 6), the
-        covariance of the pose error xi in the camera frame (metres, then radians) where the true pose is
-        T_world_camera exp(xi), None for an exact pose (sensor/pose_doubt.py). Returns the id. Raises
-        KeyframeError for a wrong shape or pose and for an invalid covariance, CapacityError if the map would
-        not fit, ConfigError for noise that does not fit the camera.
+        for the model's, and an infinite one means no measurement; ``no_return`` is (H, W), the pixels
+        without a return: bool, used according to ``sensor.no_return``, or float32, the depth up to which each
+        is free (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the pose error xi in
+        the camera frame (metres, then radians) where the true pose is T_world_camera exp(xi), None for an
+        exact pose (sensor/pose_doubt.py). Returns the id. Raises KeyframeError for a wrong shape or pose and
+        for an invalid covariance, CapacityError if the map would not fit, ConfigError for wrong noise.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"

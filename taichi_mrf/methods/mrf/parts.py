@@ -165,8 +165,8 @@ class MapParts:
         sensor = self.config.sensor
         depth = checked_depth(depth_m, camera, sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
-        if sensor.no_return != "ignore":
-            own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
+        counts = sensor.no_return != "ignore"
+        own = replace(own, no_return=checked_no_return(no_return, depth_m, camera, counts))
         image = DepthImage.upload(depth, camera, model, checked_color(color, camera), own)
         if not self.keyframes:
             warn_of_bad_sigma(image.noise_table, sensor.min_depth, sensor.max_depth)
