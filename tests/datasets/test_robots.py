@@ -90,6 +90,20 @@ def test_ros_1_is_read_too(begin: Begin) -> None:
     np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
 
 
+@pytest.mark.parametrize("way", [odometry, moving_tf])
+def test_an_image_waits_for_no_more_than_the_pose_of_its_own_stamp(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch, way: Part
+) -> None:
+    whole_ns = inputs_bags.nanoseconds
+    newest_ns = whole_ns(stamp(COUNT - 1))
+    odd_ns = next(ns for ns in range(10**6) if (newest_ns + ns) / 1e9 < (newest_ns + ns) / 10**9)
+    monkeypatch.setattr(inputs_bags, "nanoseconds", lambda stamp: whole_ns(stamp) + odd_ns)
+    _, live, bag = begin(images, mounted, way)
+    assert len(open_dataset(bag)) == COUNT
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    assert live.read(0).name == f"{COUNT - 1:06d}"
+
+
 def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
     _, live, _ = begin(plain)
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
