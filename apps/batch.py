@@ -20,7 +20,7 @@ if __name__ == "__main__":  # the command line parses the options, and calls the
 
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.lines import exit_status, listener_of, print_finished, print_run
-from taichi_mrf.cli.map.reading import learnt_from, open_recording
+from taichi_mrf.cli.map.reading import learnt_from, located_onto, open_recording
 from taichi_mrf.cli.map.several import map_several
 from taichi_mrf.cli.map.submaps import map_submaps
 from taichi_mrf.cli.map.task import MapTask, map_task, refuse_other_run
@@ -81,6 +81,7 @@ def map_to_folder(
     # The source: a recording as a table of frames, and the parameters, which may depend on it.
     runtime.init(task.settings.runtime.arch, task.settings.runtime.threads)
     dataset, settings = open_recording(task)
+    dataset, onto = located_onto(task, dataset)
     previous = resumed_map(task.out, settings) if options.resume else None
     skipped = skipped_before(task.out) if options.resume else {}
     seconds["opening"] = time.perf_counter() - start
@@ -95,7 +96,7 @@ def map_to_folder(
             seconds["learning noise"] = took
         facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned, learnt)
 
-        # The map: an empty one, or that of a run which was stopped.
+        # The map: an empty one, that of an earlier recording, or that of a run which was stopped.
         run = SequenceRun(
             dataset,
             settings,
@@ -108,6 +109,7 @@ def map_to_folder(
             resume_from=previous,
             keep=Keeper(task.out, settings, options.keep_every, facts.unfinished),
             map_path=task.out / MAP_FILE,
+            onto=onto,
         )
         run.add_keyframes()  # the loop over frames: read, track or trust the pose, choose, add, align
         run.settle()  # align all with each other if poses are refined, then infer the marginals

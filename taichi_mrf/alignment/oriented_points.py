@@ -59,8 +59,11 @@ class OrientedPoints:
 
     def thinned(self, every: int) -> "OrientedPoints":
         """Those in every ``every``-th column and row."""
-        kept = (self.places % every == 0).all(axis=1)
-        return OrientedPoints(self.points[kept], self.normals[kept], self.sigmas[kept], self.places[kept])
+        return self.chosen((self.places % every == 0).all(axis=1))
+
+    def chosen(self, rows: NDArray[np.bool_] | slice) -> "OrientedPoints":
+        """Some of them."""
+        return OrientedPoints(self.points[rows], self.normals[rows], self.sigmas[rows], self.places[rows])
 
     def about(self, number: int) -> "OrientedPoints":
         """About so many of them, evenly spread over the image."""

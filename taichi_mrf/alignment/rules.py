@@ -12,7 +12,7 @@ import numpy as np
 @dataclass(frozen=True)
 class Rules:
     """The rules in the order in which a frame meets them: its guesses, the search near them, the wide search
-    of a sensor that sees around, what makes a pose doubtful, and loops."""
+    of a sensor that sees around, the search in a whole map, what makes a pose doubtful, and loops."""
 
     keyframe_m: float = 0.2
     """Metres from one keyframe to the next where the configuration sets no step: errors of alignment add up
@@ -179,6 +179,49 @@ class Rules:
 
     least_fit: float = 0.35
     """Share of the points that have to lie on the map where a scan is found around."""
+
+    whole_frames: int = 10
+    """Frames of a stretch of a recording that is searched for in a whole map."""
+
+    whole_stretches: int = 6
+    """Stretches of a recording that are searched for, at most, before it is refused."""
+
+    whole_points: int = 10000
+    """Points of a stretch, about."""
+
+    whole_walls: int = 20000
+    """Cells of the map's surface that may be looked through, at most."""
+
+    whole_finest_m: float = 0.05
+    """Width of the last level's cells in a whole map, metres."""
+
+    whole_aside_m: float = 3.0
+    """Metres aside from the cameras of a map within which another camera is searched for."""
+
+    whole_rise_m: float = 1.0
+    """Metres above and below them."""
+
+    whole_candidates: int = 24
+    """Poses that come out of the wide search of a whole map, at most."""
+
+    whole_places: int = 5
+    """Poses that the finer levels take."""
+
+    whole_through: float = 0.05
+    """Share of the map that the images of a camera may look through where they are found in a whole map."""
+
+    whole_scan_through: float = 0.02
+    """That share for the scans of a sensor that sees around, whose sightlines are coarser."""
+
+    whole_agreement: float = 0.75
+    """Share of the points with a surface near them that have to lie on it, there."""
+
+    whole_clearly: float = 0.15
+    """Fit by which the place has to exceed any other."""
+
+    whole_sigma_m: float = 0.005
+    """Sigma of the alignment of a stretch with a map, along the direction that it determines best, metres:
+    the map's keyframes and the recording's poses are wrong by so much among themselves."""
 
     most_through: float = 0.3
     """Share of what is mapped that a camera's image may look through while it is tracked."""

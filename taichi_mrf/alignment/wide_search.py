@@ -7,6 +7,7 @@ same step, so a pose costs one look into the grid for each point (Hess et al., "
 LIDAR SLAM", 2016).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,41 +91,65 @@ class CoarseGrid:
 def candidates(points: OrientedPoints, surface: Planes, around: Around) -> list[Pose]:
     """The poses, (4, 4), at which a scan's ``points`` fit the ``surface`` best, the best one first, to about
     a cell and half a step of the heading. At least one."""
-    # Level frames of the world and of the scan.
     T_last = around.T_world_camera
     up_world = upright(surface.normals, T_last[:3, :3] @ np.asarray(around.up))
-    up_camera = upright(points.normals.astype(np.float64), T_last[:3, :3].T @ up_world)
+
+    def steps_of(cell_m: float, R_level_world: NDArray[np.float64]) -> NDArray[np.int64]:
+        reach = int(np.ceil(around.reach_m / cell_m))
+        square = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, [0], indexing="ij"), -1)
+        steps = square.reshape(-1, 3)
+        return steps[np.hypot(steps[:, 0], steps[:, 1]) <= reach]
+
+    return best_poses(points, surface, T_last, up_world, steps_of, RULES.candidates) or [T_last]
+
+
+StepsOf = Callable[[float, NDArray[np.float64]], NDArray[np.int64]]
+"""From the width of cells, metres, and the (3, 3) rotation of the world into the level frame, the steps
+(places, 3) from the first place to all that are tried, in cells of the level frame."""
+
+
+def best_poses(
+    points: OrientedPoints,
+    surface: Planes,
+    T_first: Pose,
+    up_world: NDArray[np.float64],
+    steps_of: StepsOf,
+    number: int,
+) -> list[Pose]:
+    """Up to ``number`` poses, (4, 4), at which a scan's ``points`` fit the ``surface`` best, the best one
+    first: under every heading from each place that ``steps_of`` names around the pose ``T_first``, which is
+    upright to 45 degrees. ``up_world`` (3,) is upwards in the world. None if no point is near enough."""
+    # Level frames of the world and of the scan.
+    up_camera = upright(points.normals.astype(np.float64), T_first[:3, :3].T @ up_world)
     R_level_world, R_level_camera = level_frame(up_world), level_frame(up_camera)
     ranges_m = np.linalg.norm(points.points, axis=1)
     wanted_m = np.median(ranges_m) / RULES.cells_to_median
     cell_m = float(np.clip(wanted_m, RULES.grid_finest_m, RULES.grid_widest_m))
     chosen = spread(points.points, cell_m)
     if len(chosen) == 0:
-        return [T_last]
+        return []
     level_points = points.points[chosen] @ R_level_camera.T
     level_normals = points.normals[chosen] @ R_level_camera.T
     # The cells of all points under each heading, and the steps from place to place.
-    headings = np.linspace(0.0, 2 * np.pi, RULES.headings, endpoint=False)
+    headings = np.linspace(0.0, 2 * np.pi, RULES.headings, endpoint=False, dtype=np.float64)
     turns = np.stack([turn_about_z(heading) for heading in headings])
     cells = np.floor(np.einsum("hab,nb->hna", turns, level_points) / cell_m).astype(np.int64)
     sides = np.argmax(np.einsum("hab,nb->hna", turns, level_normals) @ _SIDES.T, axis=-1)
-    reach = int(np.ceil(around.reach_m / cell_m))
-    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, [0], indexing="ij"), -1).reshape(-1, 3)
-    steps = steps[np.hypot(steps[:, 0], steps[:, 1]) <= reach]
-    margin = np.array([reach, reach, 0])
-    lowest = cells.min(axis=(0, 1)) - margin
-    shape = cells.max(axis=(0, 1)) + margin + 1 - lowest
-    surface_m = (surface.points_m - T_last[:3, 3]) @ R_level_world.T
+    steps = steps_of(cell_m, R_level_world)
+    lowest = cells.min(axis=(0, 1)) + steps.min(axis=0)
+    shape = cells.max(axis=(0, 1)) + steps.max(axis=0) + 1 - lowest
+    surface_m = (surface.points_m - T_first[:3, 3]) @ R_level_world.T
     grid = CoarseGrid.of(surface_m, surface.normals @ R_level_world.T, lowest, shape, cell_m)
     counts = scores(grid, cells, sides, steps)
     # The best poses that are apart from each other.
     found = []
-    for heading, place in peaks(counts, headings, steps * cell_m, RULES.candidates_apart * cell_m):
+    places_m = (steps * cell_m).astype(np.float64)
+    for heading, place in peaks(counts, headings, places_m, RULES.candidates_apart * cell_m, number):
         T = np.eye(4)
         T[:3, :3] = R_level_world.T @ turns[heading] @ R_level_camera
-        T[:3, 3] = T_last[:3, 3] + R_level_world.T @ (steps[place] * cell_m)
+        T[:3, 3] = T_first[:3, 3] + R_level_world.T @ (steps[place] * cell_m)
         found.append(T)
-    return found or [T_last]
+    return found
 
 
 def upright(normals: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -200,10 +225,12 @@ def peaks(
     headings: NDArray[np.float64],
     places_m: NDArray[np.float64],
     apart_m: float,
+    number: int,
 ) -> list[tuple[int, int]]:
-    """The numbers of the headings and places of the highest counts that are apart from higher ones."""
+    """The numbers of the headings and places of the ``number`` highest counts that are apart from higher
+    ones."""
     left, found = counts.copy(), []
-    for _ in range(RULES.candidates):
+    for _ in range(number):
         heading, place = (int(i) for i in np.unravel_index(np.argmax(left), left.shape))
         if left[heading, place] <= 0:
             break

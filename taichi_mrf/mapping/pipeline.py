@@ -16,7 +16,7 @@ import numpy as np
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import CapacityError, DatasetError, FrameError
+from taichi_mrf.errors import CapacityError, ConfigError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S, FINAL_AFTER_S, follower_of
@@ -33,7 +33,7 @@ from taichi_mrf.mapping.intake import (
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover, RoundStep
 from taichi_mrf.mapping.settling import FullInference
-from taichi_mrf.methods.capabilities import window_of
+from taichi_mrf.methods.capabilities import can_freeze, window_of
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
@@ -89,7 +89,8 @@ class SequenceRun:
     ``out_of_time`` ends that sweep too. ``resume_from`` is the map of such a run, of this dataset: its
     keyframes are kept and the frames after the last of them are added, which ends in the map of an
     undisturbed run. ``keep`` is called after each keyframe, and may save what there is for such a run.
-    ``map_path`` is where the map will be saved: what leaves its window is written beside it.
+    ``map_path`` is where the map will be saved: what leaves its window is written beside it. ``onto`` is a
+    map of earlier recordings, in whose world the dataset is (mapping/onto.py): its keyframes join that map.
     A frame for which there is not enough memory ends the adding: the map of those before it is inferred.
     If the dataset's poses change meanwhile (datasets/pose_sources), keyframes follow them between frames, and
     after the last frame until the poses are final.
@@ -109,18 +110,27 @@ class SequenceRun:
         resume_from: OccupancyMap | None = None,
         keep: Callable[[MappingResult], None] = lambda result: None,
         map_path: Path | None = None,
+        onto: OccupancyMap | None = None,
     ) -> None:
         """Makes the map, or goes on with one. Raises DatasetError if that is of another recording,
-        ConfigError if poses are to be refined or tracked in a map that cannot, and what the map raises."""
+        ConfigError if poses are to be refined or tracked in a map that cannot, or refined in one of earlier
+        recordings, and what the map raises."""
+        if onto is not None and config.poses.refine:
+            raise ConfigError(
+                "poses.refine moves the keyframes of the earlier map: track poses, or keep them"
+            )
         self._dataset, self._listener, self._keep = dataset, listener, keep
         self._should_stop, self._out_of_time = should_stop, out_of_time
         self._skip_bad_frames = skip_bad_frames
         self._indices = range(0, len(dataset), every)[:limit]
         if resume_from is not None:
-            check_same_frames(resume_from, dataset, self._indices)
+            check_same_frames(resume_from, dataset, self._indices, onto)
         # Refined poses depend on the map at the time: a resumed run repeats the alignment in a new map.
         goes_on = resume_from is not None and not config.poses.refine
-        m = resume_from if resume_from is not None and goes_on else create_map(config, dataset.camera)
+        if resume_from is not None and goes_on:
+            m = resume_from
+        else:
+            m = create_map(config, dataset.camera) if onto is None else onto
         if map_path is not None and (window := window_of(m)) is not None:
             window.park_beside(map_path)
         self._intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
@@ -128,13 +138,14 @@ class SequenceRun:
             self._intake.refiner.repeat(resume_from.keyframes.values())
         self._follower = follower_of(m, dataset, config.poses)
         self.result = self._intake.result
+        self.result.before = 0 if onto is None else _keyframes_in(onto)
         self.result.followed = None if self._follower is None else self._follower.done
 
     def add_keyframes(self) -> None:
         """Offer every frame that is not in the map already. Raises FrameError for an unreadable frame unless
         ``skip_bad_frames``, DatasetError if no frame became a keyframe, and what the map raises."""
         self._offer_frames()
-        if not self.result.map.keyframes:
+        if _keyframes_in(self.result.map) == self.result.before:
             raise DatasetError(_why_empty(self._dataset, self.result))
 
     def settle(self) -> None:
@@ -277,12 +288,15 @@ class SequenceRun:
                 return UnreadableFrame(self._dataset.frame_names[index], str(error))
 
 
-def check_same_frames(m: OccupancyMap, dataset: Dataset, indices: range) -> None:
-    """Refuse to resume a map of another recording: each of its keyframes must be a frame of this one, and
-    the last of them must hold the same depth. Raises DatasetError."""
+def check_same_frames(
+    m: OccupancyMap, dataset: Dataset, indices: range, onto: OccupancyMap | None = None
+) -> None:
+    """Refuse to resume a map of another recording: each of its keyframes must be a frame of this one, or of
+    the map that this one goes ``onto``, and the last must hold the same depth. Raises DatasetError."""
     names = dataset.frame_names
     mapped = {keyframe.name: keyframe for keyframe in m.keyframes.values()}
-    foreign = mapped.keys() - set(names)
+    before = set() if onto is None else {keyframe.name for keyframe in onto.keyframes.values()}
+    foreign = mapped.keys() - set(names) - before
     if foreign:
         raise DatasetError(f"cannot resume: keyframe '{min(foreign)}' is not in {dataset.name}")
     last = next((index for index in reversed(indices) if names[index] in mapped), None)
@@ -293,6 +307,11 @@ def check_same_frames(m: OccupancyMap, dataset: Dataset, indices: range) -> None
             raise DatasetError(
                 f"cannot resume: frame {names[last]} of {dataset.name} differs from the keyframe of that name"
             )
+
+
+def _keyframes_in(m: OccupancyMap) -> int:
+    """Number of a map's keyframes, frozen ones among them."""
+    return len(m.keyframes) + (len(m.frozen) if can_freeze(m) else 0)
 
 
 def _why_empty(dataset: Dataset, result: MappingResult) -> str:

@@ -23,7 +23,7 @@ class MappingResult:
     if poses were tracked, the pose of each frame, and ``loops_closed`` counts the loops. ``full`` names the
     frame that did not fit into memory and says why; the map holds those before it. ``steps``: whether depth
     and recorded poses agree, if that was checked. ``followed``: what became of poses that changed, if there
-    were any to follow.
+    were any to follow. ``before`` counts the keyframes of earlier recordings that the map began with.
     """
 
     map: OccupancyMap
@@ -40,6 +40,7 @@ class MappingResult:
     full: str | None = None
     steps: StepCheck | None = None
     followed: Followed | None = None
+    before: int = 0
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:

@@ -8,6 +8,7 @@ from typing import Any
 import taichi_mrf
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.evaluation.held_out import HeldOutCheck
+from taichi_mrf.mapping.onto import Placed
 from taichi_mrf.mapping.refinement import PoseChange
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.step_check import StepCheck
@@ -39,6 +40,7 @@ def run_report(
         "refused": None,
         "frames": result.frames,
         "keyframes": len(result.map.keyframes),
+        "keyframes_before": result.before,
         "frozen": statistics.frozen,
         "rays": sum(keyframe.rays for keyframe in result.map.keyframes.values()),
         "voxel_size": result.map.voxel_size,
@@ -52,6 +54,7 @@ def run_report(
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
         "free_space": None if result.map.promise is None else result.map.promise.to_json(),
         "noise": None,
+        "located": dataset.located.to_json() if isinstance(dataset, Placed) else None,
         "tracking": None if result.track is None else _tracking(result.track, result.loops_closed),
         "followed": None if result.followed is None else dataclasses.asdict(result.followed),
         "steps": None if result.steps is None else _steps_report(result.steps),

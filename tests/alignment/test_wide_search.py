@@ -94,7 +94,7 @@ def test_peaks_are_apart() -> None:
     )
     counts = np.zeros((36, 17), np.int32)
     counts[0, 8], counts[35, 8], counts[1, 9], counts[18, 8], counts[0, 12] = 90, 89, 88, 70, 60
-    assert peaks(counts, headings, places, 1.0) == [(0, 8), (18, 8), (0, 12)]
+    assert peaks(counts, headings, places, 1.0, 8) == [(0, 8), (18, 8), (0, 12)]
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])

@@ -92,7 +92,7 @@ def _report_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         ("backend", f"{report['backend']} ({report['device']})"),
         ("method", report["method"]),
-        ("frames", f"{report['frames']}, {_keyframes_text(report['keyframes'], report['frozen'])}"),
+        ("frames", f"{report['frames']}, {_keyframes_text(report)}"),
         *([("tracking", _tracking_text(tracking))] if tracking else []),
         ("rays", f"{report['rays']:,}"),
         ("voxels", f"{report['voxels']:,} of {report['voxel_size']} m in {report['bricks']:,} bricks"),
@@ -106,10 +106,12 @@ def _report_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _keyframes_text(keyframes: int, frozen: int) -> str:
-    if not frozen:
-        return f"{keyframes} of them keyframes"
-    return f"{keyframes + frozen} of them keyframes, {frozen} frozen outside of the window"
+def _keyframes_text(report: dict[str, Any]) -> str:
+    frozen, before = report["frozen"], report["keyframes_before"]
+    count = report["keyframes"] + frozen - before
+    if before:
+        return f"{count} of them keyframes, which join {before} of {report['onto']}"
+    return f"{count} of them keyframes" + (f", {frozen} frozen outside of the window" if frozen else "")
 
 
 def _tracking_text(tracking: dict[str, int]) -> str:

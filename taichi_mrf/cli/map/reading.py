@@ -14,7 +14,11 @@ from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
 from taichi_mrf.errors import ReadWrongError
+from taichi_mrf.mapping.onto import placed_in
 from taichi_mrf.mapping.tracking import wants_color
+from taichi_mrf.methods.capabilities import can_freeze
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import load_map
 from taichi_mrf.runs.files import CONFIG_FILE
 from taichi_mrf.runs.noise import contradicts
 
@@ -26,18 +30,33 @@ def open_recording(task: MapTask) -> tuple[Dataset, Config]:
     dataset = task.open(wants_color(settings, task.source, task.options.poses.track_poses))
     if not settings.color and METHODS[settings.method].has_colors:
         note_unused_color(dataset, task.source, task.options.reading)
-    settings = with_recorded_noise(settings, dataset)
+    if task.options.onto is None:
+        settings = with_recorded_noise(settings, dataset)
     if not task.options.force:
         _refuse_what_is_read_wrong(task, dataset)
     return dataset, settings
+
+
+def located_onto(task: MapTask, dataset: Dataset) -> tuple[Dataset, OccupancyMap | None]:
+    """With ``--onto``, the recording where it lies in that map, and the map; else the recording, and None.
+    Raises MapFileError, and DatasetError if it is not found."""
+    options = task.options
+    if options.onto is None:
+        return dataset, None
+    m = load_map(options.onto, task.settings.volume.memory_limit_gb)
+    dataset = placed_in(m, str(options.onto), dataset)
+    if options.frozen and can_freeze(m):
+        for id in list(m.keyframes):
+            m.freeze_keyframe(id)
+    return dataset, m
 
 
 def learnt_from(
     task: MapTask, dataset: Dataset, settings: Config, progress: ProgressBar, request: StopRequest
 ) -> LearntSigma | None:
     """Noise learnt from the recording, if that was asked for, or if it contradicts the default. A resumed run
-    has learnt it."""
-    if task.options.resume and (task.out / CONFIG_FILE).is_file():
+    has learnt it, and so has an earlier map."""
+    if task.options.onto is not None or (task.options.resume and (task.out / CONFIG_FILE).is_file()):
         return None
     learnt = None
     if task.options.noise.is_learnt:

@@ -17,6 +17,8 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
+from taichi_mrf.mapping.onto import parameters_onto
+from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 from taichi_mrf.system import runtime
 
@@ -82,7 +84,8 @@ class MapTask:
         """Choices besides the parameters; the report says them too."""
         options = self.options
         noise = {} if options.noise == NoiseFlags() else {"noise_from": options.noise.origin}
-        return {"every": options.every, "limit": options.limit, **noise, **options.poses.choice()}
+        onto = {} if options.onto is None else {"onto": str(options.onto), "frozen_before": options.frozen}
+        return {"every": options.every, "limit": options.limit, **onto, **noise, **options.poses.choice()}
 
     def open(self, color: bool) -> Dataset:
         """Open the sequence. Raises DatasetError."""
@@ -92,9 +95,14 @@ class MapTask:
 
 
 def map_task(options: Map, source: str, out: Path) -> MapTask:
-    """The part of a command that concerns one of its sources."""
+    """The part of a command that concerns one of its sources. With ``--onto`` the parameters are those of
+    that map: raises MapFileError, and ConfigError for others."""
     start = Path.cwd()
     settings = with_absolute_tables(options.poses.parameters(options.settings), start)
+    if options.onto is not None:
+        with open_map_file(options.onto) as file:
+            of_map = read_header(options.onto, file).config
+        settings = parameters_onto(of_map, settings, Config(), str(options.onto))
     return MapTask(replace(options, sources=(source,), out=out, settings=settings), start)
 
 
@@ -138,7 +146,8 @@ def _changed_parameters(task: MapTask) -> list[str]:
     if set(_RECORDED) & set(changed):
         if is_rendered(task.source):
             runtime.init(task.settings.runtime.arch, task.settings.runtime.threads)
-        changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
+        if task.options.onto is None:
+            changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
     return [name for name in changed if not (name in LEARNT and _learns_noise(task))]
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least
+from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least, check_onto
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -54,6 +54,13 @@ class Map:
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Map a recording that is surely not read as it was written, and keep a map that its held-out frames
     contradict. Without it, both end with status 4, and so does an empty map."""
+
+    onto: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
+    """Go on with the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
+    keyframes join those of the map. A SOURCE that is not found there for sure is refused."""
+
+    frozen: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """With --onto: keep the earlier keyframes as evidence only, without their images."""
 
     keep_every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 30.0
     """Seconds between crash checkpoints; stretched automatically so that saving takes at most 5% of the
@@ -104,6 +111,11 @@ class Map:
             raise ConfigError("--resume and --overwrite do not go together")
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
-        self.noise.refuse_with(track_poses=self.poses.track_poses, submap_size=self.submap_size)
+        self.noise.refuse_with(
+            track_poses=self.poses.track_poses, submap_size=self.submap_size, onto=self.onto
+        )
+        check_onto(self.onto, self.frozen, self.poses)
+        if self.onto is not None and (len(self.sources) > 1 or self.submap_size is not None):
+            raise ConfigError("--onto takes one SOURCE, and does not work with --submap-size")
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")

@@ -1,6 +1,7 @@
 """Flags and checks that the options of several commands share."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -113,3 +114,12 @@ class PoseFlags:
         return (
             replace(settings, poses=replace(settings.poses, refine=True)) if self.refine_poses else settings
         )
+
+
+def check_onto(onto: Path | None, frozen: bool, poses: PoseFlags) -> None:
+    """Raise ConfigError for flags that do not go with ``--onto``, or without it."""
+    if frozen and onto is None:
+        raise ConfigError("--frozen is for the keyframes of an earlier map: add --onto MAP")
+    if onto is not None and (poses.refine_poses or poses.follow):
+        flag = "--refine-poses" if poses.refine_poses else "--follow"
+        raise ConfigError(f"{flag} moves keyframes, and does not work with --onto")

@@ -1,0 +1,275 @@
+"""Place of a recording in a map of another day, without a guess: where its frames fit of all the map.
+
+A stretch of ten frames, by their own poses one scan, is tried at every place near the cameras of the map and
+under every heading (wide_search). What fits best is aligned from coarse to fine, fewer poses at each level.
+A place counts only if the surface of the stretch lies on that of the map, its images do not look through what
+the map has there, its points determine all six directions, and no other place fits nearly as well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from taichi_mrf.alignment.levels import LEAST_POINTS, grids_of
+from taichi_mrf.alignment.levenberg import align, determined
+from taichi_mrf.alignment.locate import agreement
+from taichi_mrf.alignment.locate_around import FoundPose, distinct
+from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
+from taichi_mrf.alignment.point_to_plane import PointToPlane
+from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
+from taichi_mrf.alignment.rules import RULES
+from taichi_mrf.alignment.seen_through import Sightlines, looked_through
+from taichi_mrf.alignment.surfel_grid import SurfelGrid
+from taichi_mrf.alignment.surfels import Planes, Surfels
+from taichi_mrf.alignment.wide_search import best_poses, level_frame, upright
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.sensor.camera import sees_around
+
+UNKNOWN = np.full((6, 6), np.inf)
+
+THINNED = (8, 2, 1)
+"""One point in so many is aligned at the coarse levels."""
+
+FREE = PoseConfig(translation_sigma=RULES.around_free_m, rotation_sigma=RULES.around_free_rad)
+
+
+@dataclass(frozen=True)
+class LocatedRecording:
+    """Place of a recording in a map: ``T_map_recording`` (4, 4) takes its world to that of the map. None if
+    it is not known, for ``reason``; ``places`` are the two that look alike, if that is the reason.
+
+    ``covariance`` (6, 6) is that of the twist (rho, omega) of the middle camera of the ``frames``, in its
+    frame. ``overlap`` is the share of what the frames see that lies near the map, ``agreement`` the share of
+    that which lies on it, and ``through`` the share of the map that they would look through.
+    """
+
+    T_map_recording: Pose | None
+    reason: str = ""
+    covariance: NDArray[np.float64] = field(default_factory=UNKNOWN.copy)
+    overlap: float = 0.0
+    agreement: float = 0.0
+    through: float = 0.0
+    places: tuple[Pose, ...] = ()
+    frames: tuple[str, ...] = ()
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the camera's place, metres."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def sigma_rad(self) -> float:
+        """Standard deviation of the camera's turn."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    def in_words(self) -> str:
+        """``3 cm, 0.8 degrees, 91% of what is seen agrees``, or why it is not known."""
+        if self.T_map_recording is None:
+            return self.reason
+        sigma_m, degrees = 100 * self.sigma_m, np.degrees(self.sigma_rad)
+        return f"{sigma_m:.0f} cm, {degrees:.1f} degrees, {100 * self.agreement:.0f}% of what is seen agrees"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, lengths in metres."""
+        T = self.T_map_recording
+        return {
+            "T_map_recording": None if T is None else T.tolist(),
+            "covariance": self.covariance.tolist(),
+            "overlap": self.overlap,
+            "agreement": self.agreement,
+            "looked_through": self.through,
+            "frames": list(self.frames),
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True)
+class WholeMap:
+    """What a map shows of its world: its ``surface``, the ``walls`` that several of its keyframes have
+    measured, which nothing can look through, the places ``cameras_m`` (N, 3) of its keyframes, and ``up``
+    (3,), upwards in its world to 45 degrees."""
+
+    surface: Surfels
+    walls: Planes
+    cameras_m: NDArray[np.float64]
+    up: NDArray[np.float64]
+
+    @cached_property
+    def planes(self) -> Planes:
+        """The surface where a wide search looks for it."""
+        return self.surface.coarser(max(1, round(RULES.around_finest_m / self.surface.cell_size))).planes()
+
+    @cached_property
+    def coarse(self) -> list[SurfelGrid]:
+        """Levels on which candidates are aligned."""
+        return grids_of(self.surface, RULES.around_first_m, RULES.around_finest_m)
+
+    @cached_property
+    def fine(self) -> list[SurfelGrid]:
+        """Levels on which the best of them are."""
+        return grids_of(self.surface, RULES.around_finest_m, RULES.whole_finest_m)[1:]
+
+
+def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
+    """What cannot be looked through of a map's surface: cells in which more than one of its ``parts``, those
+    of its keyframes, have measured something. RULES.whole_walls of them, evenly, if there are more."""
+    keys, number = np.unique(np.concatenate([part.keys for part in parts]), return_counts=True)
+    rows = np.flatnonzero(np.isin(surface.keys, keys[number > 1]))
+    some = np.linspace(0, len(rows) - 1, min(len(rows), RULES.whole_walls)).astype(np.int64)
+    return surface.chosen(rows[some]).planes()
+
+
+class Stretch:
+    """Some frames of a recording as one scan, in the frame of the middle one's camera."""
+
+    def __init__(
+        self, images: Sequence[DepthImage], T_recording_camera: Sequence[Pose], max_depth: float
+    ) -> None:
+        """``images`` with their poses (4, 4) in the recording's world; points up to ``max_depth`` metres
+        count."""
+        self.T_recording_scan = T_recording_camera[len(images) // 2]
+        T_scan_recording = inverse(self.T_recording_scan)
+        self.T_scan_camera = [T_scan_recording @ T for T in T_recording_camera]
+        self.images = images
+        ups = [T[:3, :3] @ image.camera.up for image, T in zip(images, self.T_scan_camera, strict=True)]
+        self.up = np.mean(ups, axis=0)
+        self.points = _one_scan(
+            [oriented_points(image, max_depth) for image in images],
+            self.T_scan_camera,
+            RULES.whole_points // len(images),
+        )
+        self.around = sees_around(images[0].camera)
+        self._sights = [Sightlines.of(image) for image in images] if self.around else []
+
+    def looks_through(self, surface: Planes, T_map_scan: Pose) -> float:
+        """The share of a mapped surface that the images look through from a pose (4, 4), in the mean."""
+        poses = [T_map_scan @ T for T in self.T_scan_camera]
+        if self._sights:
+            shares = [sight.seen_through(surface, T) for sight, T in zip(self._sights, poses, strict=True)]
+        else:
+            pairs = zip(self.images, poses, strict=True)
+            shares = [looked_through(surface, image, T) for image, T in pairs]
+        return float(np.mean(shares))
+
+
+def _one_scan(parts: Sequence[OrientedPoints], poses: Sequence[Pose], of_each: int) -> OrientedPoints:
+    """Points of several images in one frame, about ``of_each`` of every image."""
+    thin = [part.about(of_each) for part in parts]
+    pairs = list(zip(thin, poses, strict=True))
+    points = [part.points @ T[:3, :3].T + T[:3, 3] for part, T in pairs]
+    normals = [part.normals @ T[:3, :3].T for part, T in pairs]
+    return OrientedPoints(
+        np.concatenate(points).astype(np.float32),
+        np.concatenate(normals).astype(np.float32),
+        np.concatenate([part.sigmas for part in thin]),
+        np.concatenate([part.places for part in thin]),
+    )
+
+
+def locate_stretch(stretch: Stretch, whole: WholeMap) -> LocatedRecording:
+    """The place of a stretch in a whole map, or a refusal."""
+    points = stretch.points
+    if len(points.points) < LEAST_POINTS or len(whole.planes.points_m) < LEAST_POINTS:
+        return LocatedRecording(None, "too little seen: hardly any point lies on a smooth surface")
+    # 1. Every heading at every place near the map's cameras.
+    poses = _candidates(stretch, whole)
+    # 2. From coarse to fine, the best of them.
+    lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
+
+    def aligned(grid: SurfelGrid, every: int, poses: Sequence[Pose]) -> list[FoundPose]:
+        problem = PointToPlane(points.chosen(slice(None, None, every)), grid)
+        ends = [align(problem, T, Recorded(T, FREE), lever_m, RULES.observable) for T in poses]
+        through = [stretch.looks_through(whole.walls, end.T_world_camera) for end in ends]
+        found = [
+            FoundPose(end, share, end.equations.fit - share) for end, share in zip(ends, through, strict=True)
+        ]
+        return distinct(found, RULES.one_pose_m)
+
+    places: list[FoundPose] = []
+    for grid, every in zip(whole.coarse, THINNED, strict=True):
+        places = aligned(grid, every, poses)
+        poses = [place.end.T_world_camera for place in places]
+    for grid in whole.fine:
+        places = aligned(grid, 1, poses[: RULES.whole_places])
+        poses = [place.end.T_world_camera for place in places]
+    # 3. What the best is worth, and whether any other is worth nearly as much.
+    return _judged(stretch, places, lever_m) if places else LocatedRecording(None, "it fits nowhere")
+
+
+def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
+    up_map = upright(whole.planes.normals, whole.up)
+    T_first = np.eye(4)
+    # An upright scan amid the cameras: any heading will do.
+    T_first[:3, :3] = level_frame(up_map).T @ level_frame(stretch.up / np.linalg.norm(stretch.up))
+    T_first[:3, 3] = np.median(whole.cameras_m, axis=0)
+
+    def near_cameras(cell_m: float, R_level_world: NDArray[np.float64]) -> NDArray[np.int64]:
+        cells = np.rint((whole.cameras_m - T_first[:3, 3]) @ R_level_world.T / cell_m).astype(np.int64)
+        aside, rise = (int(np.ceil(m / cell_m)) for m in (RULES.whole_aside_m, RULES.whole_rise_m))
+        reach = np.array([aside, aside, rise])
+        lowest = cells.min(axis=0) - reach
+        near = np.zeros(cells.max(axis=0) + reach + 1 - lowest, bool)
+        near[tuple((cells - lowest).T)] = True
+        x, y, _ = np.ogrid[-aside : aside + 1, -aside : aside + 1, 0:1]
+        near = ndimage.binary_dilation(near, x**2 + y**2 <= aside**2)
+        near = ndimage.binary_dilation(near, np.ones((1, 1, 2 * rise + 1), bool))
+        return np.argwhere(near) + lowest
+
+    number = RULES.whole_candidates
+    return best_poses(stretch.points, whole.planes, T_first, up_map, near_cameras, number)
+
+
+def _judged(stretch: Stretch, places: Sequence[FoundPose], lever_m: float) -> LocatedRecording:
+    """Verdict on the best of several places."""
+    best, *others = places
+    equations, T_scan_recording = best.end.equations, inverse(stretch.T_recording_scan)
+    seen = LocatedRecording(
+        None, overlap=equations.overlap, agreement=agreement(equations), through=best.through
+    )
+    reason = _objection(seen, best, stretch.around)
+    if reason:
+        return replace(seen, reason=reason)
+    alike = [place for place in others if place.worth > best.worth - RULES.whole_clearly]
+    T_map_recording = [place.end.T_world_camera @ T_scan_recording for place in (best, *alike)]
+    if alike:
+        apart_rad, apart_m = tangent_norms(best.end.T_world_camera, alike[0].end.T_world_camera)
+        first, second = (_place_of(place) for place in (best, alike[0]))
+        reason = (
+            f"two places look alike, {apart_m:.1f} m and {np.degrees(apart_rad):.0f} degrees apart: "
+            f"{first} and {second}"
+        )
+        return replace(seen, reason=reason, places=tuple(T_map_recording[:2]))
+    certain = equations.worth * (SURFACE_SIGMA_M / RULES.whole_sigma_m) ** 2
+    information = certain * determined(equations.H, lever_m, RULES.observable)
+    covariance = np.linalg.pinv(information).astype(np.float64)
+    return replace(seen, T_map_recording=T_map_recording[0], covariance=covariance)
+
+
+def _objection(seen: LocatedRecording, best: FoundPose, around: bool) -> str:
+    """Reason to doubt the place that fits best, with what is ``seen`` there; empty if there is none."""
+    fit = best.end.equations.fit
+    if fit < RULES.least_fit:
+        return (
+            f"another place, or too little of it seen: {100 * fit:.0f}% of what is seen fits where most does"
+        )
+    if seen.agreement < RULES.whole_agreement:
+        return f"another place: where it fits best, {100 * seen.agreement:.0f}% of what is seen agrees"
+    most = RULES.whole_scan_through if around else RULES.whole_through
+    if seen.through > most:
+        share = 100 * seen.through
+        return f"another place: where it fits best, it would look through {share:.0f}% of what is mapped"
+    if best.end.directions < 6:
+        return f"too little seen: it determines {best.end.directions} of the six directions of its place"
+    return ""
+
+
+def _place_of(place: FoundPose) -> str:
+    x, y, z = place.end.T_world_camera[:3, 3]
+    return f"({x:.1f}, {y:.1f}, {z:.1f}) m"

@@ -1,0 +1,281 @@
+"""A recording of today in the map of yesterday: found in it, and read in the map's world.
+
+A few stretches of the recording are searched for in what the map's keyframes have measured
+(alignment/whole_map.py). Once one is found, all frames are read where they belong, and are mapped as if they
+had been taken in the same run.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.alignment.rules import RULES
+from taichi_mrf.alignment.whole_map import LocatedRecording, Stretch, WholeMap, locate_stretch, walls_of
+from taichi_mrf.config.registry import methods_with
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import differences
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.base import EndlessNames, StampedPoses
+from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.geometry.up import up_vector
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
+from taichi_mrf.mapping.intake import Added, Intake
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.frame import Frame
+
+EVERYWHERE = np.full(3, np.inf)
+
+MAY_DIFFER = (
+    "inference.sweeps",
+    "keyframes.",
+    "evaluation.",
+    "poses.close_loops",
+    "runtime.",
+    "volume.memory_limit_gb",
+)
+"""Parameters (or groups) in which a run that goes on with a map may differ from it."""
+
+
+def parameters_onto(of_map: Config, asked: Config, default: Config, where: str) -> Config:
+    """The parameters with which a recording goes on in a map: those ``of_map``, and those of MAY_DIFFER that
+    are ``asked`` for and not the ``default``. Raises ConfigError, which begins with ``where``, for any other
+    that is asked for and differs."""
+    wanted = [name for name in differences(default, asked) if name != "fit_voxel_size"]
+    others = set(differences(of_map, asked))
+    refused = [name for name in wanted if name in others and not name.startswith(MAY_DIFFER)]
+    if refused:
+        raise ConfigError(
+            f"{where}: was made with another {', '.join(refused)}, which holds for all that is added to it"
+        )
+    parameters = replace(of_map, runtime=asked.runtime, fit_voxel_size=False)
+    for name in wanted:
+        section, _, field_name = name.partition(".")
+        if field_name:
+            value = getattr(getattr(asked, section), field_name)
+            changed = replace(getattr(parameters, section), **{field_name: value})
+            parameters = replace(parameters, **{section: changed})
+    return parameters
+
+
+ReadFrame = Callable[[int], Frame]
+
+
+def locate(m: OccupancyMap, frames: Sequence[Frame] | Dataset) -> LocatedRecording:
+    """Find a recording in a map whose keyframes were taken in the same place at another time.
+
+    ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
+    The answer has ``T_map_recording``, or None and a ``reason``. Raises ConfigError if keyframes cannot be
+    aligned in a map of this method, or if the map has none, and what reading frames raises.
+    """
+    if not can_refine_poses(m):
+        raise ConfigError(
+            f"a recording is found in maps of the method {methods_with('can_refine_poses')}, "
+            f"not {m.METHOD.name}"
+        )
+    whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
+    for stretch, names in _stretches(m, frames):
+        now = replace(locate_stretch(stretch, whole), frames=names)
+        if now.T_map_recording is not None:
+            return now
+        # Of several refusals the one counts that says most: two places that look alike, or the best fit.
+        if not found.frames or (len(now.places), now.overlap) > (len(found.places), found.overlap):
+            found = now
+    return found
+
+
+def whole_map(m: MRFMap) -> WholeMap:
+    """The surface that a map's keyframes have measured. Raises ConfigError if it has none."""
+    if m.up is None or not m.keyframes:
+        raise ConfigError("nothing can be found in a map without keyframes (frozen ones have no images)")
+    m.aligner.surface.update(m.keyframes)
+    surface = m.aligner.surface.around(-EVERYWHERE, EVERYWHERE)
+    walls = walls_of(surface, [m.aligner.surface.of([id]) for id in m.keyframes])
+    cameras_m = np.stack([keyframe.T_world_camera[:3, 3] for keyframe in m.keyframes.values()])
+    return WholeMap(surface, walls, cameras_m, up_vector(m.up))
+
+
+def frame_of(keyframe: Keyframe) -> Frame:
+    """A keyframe of a map as the frame that it was."""
+    return Frame(
+        keyframe.depth_m,
+        keyframe.T_world_camera,
+        keyframe.camera,
+        keyframe.stamp_s,
+        keyframe.name,
+        color=keyframe.color,
+        sigma_m=keyframe.own.sigma_m,
+        noise=keyframe.own.noise,
+        no_return=keyframe.own.no_return,
+    )
+
+
+def _stretches(m: MRFMap, frames: Sequence[Frame] | Dataset) -> Iterator[tuple[Stretch, tuple[str, ...]]]:
+    """Stretches of a recording, from its beginning and from further on, with the names of their frames."""
+    if isinstance(frames, Dataset) and (frames.tracked or frames.endless):
+        parts: Iterator[list[Frame]] = _tracked(m, frames)
+    else:
+        parts = _posed(frames.read if isinstance(frames, Dataset) else frames.__getitem__, len(frames))
+    for part in parts:
+        images = [_image(m, frame) for frame in part]
+        stretch = Stretch(images, [frame.T_world_camera for frame in part], m.sensor.max_depth)
+        yield stretch, tuple(frame.name for frame in part)
+
+
+def _image(m: MRFMap, frame: Frame) -> DepthImage:
+    depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
+    return DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
+
+
+def _posed(read: ReadFrame, count: int) -> Iterator[list[Frame]]:
+    """Frames of a recording that has poses, in stretches that begin all along it. Broken frames are left
+    out."""
+    last = -1
+    for first in np.unique(np.linspace(0, count, RULES.whole_stretches, endpoint=False).astype(int)):
+        part: list[Frame] = []
+        for index in range(max(last + 1, int(first)), count):
+            last = index
+            try:
+                frame = read(index)
+            except FrameError:
+                continue
+            if _tells_more(part, frame):
+                part.append(frame)
+            if len(part) == RULES.whole_frames:
+                break
+        if part:
+            yield part
+
+
+def _tells_more(part: Sequence[Frame], frame: Frame) -> bool:
+    """True if a frame measures anything, from elsewhere than the last of a stretch."""
+    if not frame.depth_m.any():
+        return False
+    if not part:
+        return True
+    turned_rad, moved_m = tangent_norms(part[-1].T_world_camera, frame.T_world_camera)
+    return moved_m > RULES.keyframe_m / 2 or turned_rad > RULES.keyframe_rad / 2
+
+
+def _tracked(m: MRFMap, dataset: Dataset) -> Iterator[list[Frame]]:
+    """Keyframes of a camera that is tracked in a map of its own, in stretches."""
+    intake = Intake(create_map(m.config, dataset.camera), m.config, tracked=True)
+    part: list[Frame] = []
+    for index in range(len(dataset)):
+        try:
+            answer = intake.offer(dataset.read(index), index + 1, index)
+        except FrameError:
+            continue
+        if isinstance(answer, Added):
+            part.append(answer.frame)
+        if len(part) == RULES.whole_frames:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
+    """The frames of a dataset in the world of a map, with names that the map does not have, and later than
+    its newest keyframe if their clock begins before it. Raises DatasetError if the dataset is not found in
+    the map, which is called ``name``."""
+    located = locate(m, dataset)
+    if located.T_map_recording is None:
+        raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
+    notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]
+    newest_s = max(keyframe.stamp_s for keyframe in m.keyframes.values())
+    first_s = newest_s if dataset.endless else float(dataset.stamps()[0])
+    later_s = newest_s + NEXT_S - first_s if first_s < newest_s else 0.0
+    if later_s:
+        notes.append(f"Its clock begins before the newest keyframe of {name}: {later_s:.0f} s are added.")
+    return Placed(
+        dataset.name,
+        dataset.camera,
+        notes,
+        dataset.dropped,
+        tracked=dataset.tracked,
+        source=dataset,
+        located=located,
+        prefix=_prefix(m, dataset),
+        later_s=later_s,
+        map_origin_m=np.asarray(m.config.volume.origin),
+    )
+
+
+def _prefix(m: OccupancyMap, dataset: Dataset) -> str:
+    """Prefix under which no frame of a dataset has the name of a keyframe of a map; empty if none has."""
+    taken = {keyframe.name for keyframe in m.keyframes.values()}
+    if not dataset.endless and taken.isdisjoint(dataset.frame_names):
+        return ""
+    days = (f"{day}:" for day in itertools.count(2))
+    return next(day for day in days if not any(name.startswith(day) for name in taken))
+
+
+NEXT_S = 1.0
+"""Seconds from a map's newest keyframe to the first frame of a recording whose clock began earlier."""
+
+
+@dataclass
+class Placed(Derived):
+    """The frames of ``source`` in the world of a map, where they were ``located``.
+
+    ``prefix`` goes before their names, and ``later_s`` is added to their stamps.
+    """
+
+    located: LocatedRecording = field(kw_only=True)
+    prefix: str = field(kw_only=True)
+    later_s: float = field(kw_only=True)
+    map_origin_m: NDArray[np.float64] = field(kw_only=True)
+
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """The map's."""
+        return self.map_origin_m
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The source's, after the prefix."""
+        names = self.source.frame_names
+        if isinstance(names, EndlessNames):
+            return EndlessNames(f"{self.prefix}{names.prefix}")
+        return [f"{self.prefix}{name}" for name in self.source.frame_names]
+
+    @property
+    def T_map_recording(self) -> Pose:
+        """(4, 4): from the world of the recording to that of the map."""
+        assert self.located.T_map_recording is not None
+        return self.located.T_map_recording
+
+    def stamps(self) -> Sequence[float] | NDArray[np.float64]:
+        """The source's, later."""
+        return np.asarray(self.source.stamps(), np.float64) + self.later_s
+
+    def pose(self, index: int) -> Pose:
+        """The source's, in the map."""
+        return self.T_map_recording @ self.source.pose(index)
+
+    def own_poses(self) -> StampedPoses | None:
+        """The source's, in the map."""
+        known = self.source.own_poses()
+        if known is None:
+            return None
+        stamps, poses = known
+        return np.asarray(stamps, np.float64) + self.later_s, [self.T_map_recording @ T for T in poses]
+
+    def read(self, index: int) -> Frame:
+        """The source's frame, in the map. Raises what the source raises."""
+        frame = self.source.read(index)
+        return replace(
+            frame,
+            T_world_camera=self.T_map_recording @ frame.T_world_camera,
+            stamp=frame.stamp + self.later_s,
+            name=f"{self.prefix}{frame.name}",
+            origin_m=tuple(self.map_origin_m),
+        )
