@@ -90,7 +90,7 @@ class LocatedRecording:
             "looked_through": self.through,
             "in_free_space": self.in_free,
             "frames": list(self.frames),
-            "reason": self.reason,
+            "says": self.in_words(),
         }
 
 
@@ -191,13 +191,19 @@ def _one_scan(parts: Sequence[OrientedPoints], poses: Sequence[Pose], of_each: i
     )
 
 
-def locate_stretch(stretch: Stretch, whole: WholeMap) -> LocatedRecording:
-    """The place of a stretch in a whole map, or a refusal."""
+def locate_stretch(
+    stretch: Stretch, whole: WholeMap, T_map_recording: Pose | None = None
+) -> LocatedRecording:
+    """The place of a stretch in a whole map, or a refusal. If it is thought to be at ``T_map_recording``
+    (4, 4), it is looked for only near there."""
     points = stretch.points
     if len(points.points) < LEAST_POINTS or len(whole.planes.points_m) < LEAST_POINTS:
         return LocatedRecording(None, "too little seen: hardly any point lies on a smooth surface")
     # 1. Every heading at every place near the map's cameras.
-    poses = _candidates(stretch, whole)
+    if T_map_recording is None:
+        poses = _candidates(stretch, whole)
+    else:
+        poses = [T_map_recording @ stretch.T_recording_scan]
     # 2. From coarse to fine, the best of them.
     lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
 

@@ -85,6 +85,25 @@ def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
     return Merged(m, tuple(located), int((trust > RULES.trusted).sum()), moved_m)
 
 
+def lay_over(a: OccupancyMap, b: OccupancyMap) -> LocatedRecording | None:
+    """Move the keyframes of map b to where they lie in the world of map a, and infer it, unless it stands
+    there already. Returns where it was found, or why not; None if it stands there, or if keyframes of one of
+    the maps cannot be aligned, or are frozen."""
+    if not (can_refine_poses(a) and can_refine_poses(b)) or a.frozen or b.frozen:
+        return None
+    if not (a.keyframes and b.keyframes):
+        return None
+    frames = [frame_of(keyframe) for keyframe in b.keyframes.values()]
+    if locate(a, frames, np.eye(4)).T_map_recording is not None:
+        return None
+    found = locate(a, frames)
+    if found.T_map_recording is not None:
+        for id, keyframe in b.keyframes.items():
+            b.move_keyframe(id, as_pose(found.T_map_recording @ keyframe.T_world_camera))
+        b.infer()
+    return found
+
+
 def _checked(maps: Sequence[OccupancyMap], names: Sequence[str]) -> list[MRFMap]:
     if len(maps) < 2:
         raise ConfigError("there is nothing to merge: pass two maps or more")

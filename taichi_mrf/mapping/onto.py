@@ -69,12 +69,15 @@ def parameters_onto(of_map: Config, asked: Config, default: Config, where: str) 
 ReadFrame = Callable[[int], Frame]
 
 
-def locate(m: OccupancyMap, frames: Sequence[Frame] | Dataset) -> LocatedRecording:
+def locate(
+    m: OccupancyMap, frames: Sequence[Frame] | Dataset, T_map_recording: Pose | None = None
+) -> LocatedRecording:
     """Find a recording in a map whose keyframes were taken in the same place at another time.
 
     ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
-    The answer has ``T_map_recording``, or None and a ``reason``. Raises ConfigError if keyframes cannot be
-    aligned in a map of this method, or if the map has none, and what reading frames raises.
+    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. The answer
+    has ``T_map_recording``, or None and a ``reason``. Raises ConfigError if keyframes cannot be aligned in a
+    map of this method, or if the map has none, and what reading frames raises.
     """
     if not can_refine_poses(m):
         raise ConfigError(
@@ -83,7 +86,7 @@ def locate(m: OccupancyMap, frames: Sequence[Frame] | Dataset) -> LocatedRecordi
         )
     whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
     for stretch, names in _stretches(m, frames):
-        now = replace(locate_stretch(stretch, whole), frames=names)
+        now = replace(locate_stretch(stretch, whole, T_map_recording), frames=names)
         if now.T_map_recording is not None:
             return now
         # Of several refusals the one counts that says most: two places that look alike, or the best fit.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.change import MapChange
 from taichi_mrf.queries.frontiers import find_clusters
-from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, rows_around
 from taichi_mrf.voxels.pool import BrickPool
@@ -102,10 +102,15 @@ class Surfaces:
 def stands_clear(voxels: NDArray[np.int32], surfaces: Surfaces, core: int = CORE_VOXELS) -> NDArray[np.bool_]:
     """True for the voxels, coordinates (n, 3), of a cluster of which at least ``core`` are clear of the
     surfaces, (n,)."""
+    return _in_clusters(voxels, surfaces.clear(voxels), core)
+
+
+def _in_clusters(voxels: NDArray[np.int32], marked: NDArray[np.bool_], core: int) -> NDArray[np.bool_]:
+    """True for the voxels (n, 3) of a cluster of which at least ``core`` are ``marked`` (n,)."""
     cells, cell = np.unique(voxels // CELL_VOXELS, axis=0, return_inverse=True)
     cluster = find_clusters(cells)[0][cell.reshape(-1)]
-    clear = np.bincount(cluster[surfaces.clear(voxels)], minlength=len(cells))
-    return np.asarray(clear[cluster] >= core)
+    count = np.bincount(cluster[marked], minlength=len(cells))
+    return np.asarray(count[cluster] >= core)
 
 
 Verb = Literal["appeared", "left"]
@@ -140,6 +145,11 @@ def without_slack(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_
     for before, after, other in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
         rows = np.flatnonzero((change.before == before) & (change.after == after))
         kept[rows] = stands_clear(voxels[rows], Surfaces(other.view.pool, other.voxel_size), core)
+    return _chosen(change, kept)
+
+
+def _chosen(change: MapChange, kept: NDArray[np.bool_]) -> MapChange:
+    """Some of the voxels that have changed."""
     return replace(
         change,
         points=change.points[kept],
@@ -147,6 +157,22 @@ def without_slack(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_
         after=change.after[kept],
         difference=change.difference[kept],
     )
+
+
+def amid_known(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_VOXELS) -> MapChange:
+    """Voxels that appeared or left, without clusters of which fewer than ``core`` voxels have only known ones
+    beside them in the map in which they are free: at the edge of what that map has seen, the surface of the
+    other map may begin in the next voxel."""
+    kept = np.zeros(len(change.points), np.bool_)
+    beside = a.voxel_size * np.concatenate([np.eye(3), -np.eye(3)])
+    for before, after, free_in in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
+        rows = np.flatnonzero((change.before == before) & (change.after == after))
+        points = change.points[rows]
+        known = np.ones(len(rows), np.bool_)
+        for step in beside:
+            known &= free_in.state(points + step) != UNKNOWN
+        kept[rows] = _in_clusters(np.floor(points / a.voxel_size).astype(np.int32), known, core)
+    return _chosen(change, kept)
 
 
 def find_changed_things(

@@ -4,16 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from two_days import CONFIG, COUNT, TODAY, YESTERDAY, recorded, turned_away
+from two_days import CONFIG, COUNT, STOOL, TODAY, YESTERDAY, recorded, turned_away
 
 import taichi_mrf as tm
+from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.mapping.merging import frame_of, merge
+from taichi_mrf.mapping.merging import frame_of, lay_over, merge
 from taichi_mrf.mapping.onto import locate
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.change import compare_maps
+from taichi_mrf.queries.changed_things import (
+    CORE_VOXELS,
+    ChangedThing,
+    amid_known,
+    find_changed_things,
+    without_slack,
+)
 from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -108,3 +117,36 @@ def test_maps_that_cannot_be_merged_are_named() -> None:
     a.freeze_keyframe(next(iter(a.keyframes)))
     with pytest.raises(ConfigError, match=r"^a: 1 keyframes are frozen"):
         merge([a, elsewhere], ["a", "b"])
+
+
+FINER = replace(CONFIG, voxel_size=0.05)
+
+
+def things(a: MRFMap, b: MRFMap) -> list[ChangedThing]:
+    change = amid_known(without_slack(compare_maps(a, b), a, b), a, b)
+    return find_changed_things(change, a.voxel_size, CORE_VOXELS, 0.1)
+
+
+def test_what_was_moved_between_the_days_is_all_that_differs() -> None:
+    """A chair came, in a map of another world."""
+    a = map_sequence(recorded(YESTERDAY), FINER).map
+    today = map_sequence(recorded(TODAY, turned_away(6), STOOL, "today"), FINER).map
+    found = lay_over(a, today)
+    assert found is not None
+    assert found.T_map_recording is not None, found.reason
+    (came,) = things(a, today)
+    assert came.verb == "appeared"
+    assert np.abs(came.centre_m[:2] - (np.array([0.2, 1.0]) + ROOM_IN_WORLD[:2])).max() < 0.15
+    (left,) = things(today, a)
+    assert left.verb == "left"
+
+
+def test_maps_of_one_world_are_compared_as_they_stand() -> None:
+    a, b = (map_sequence(recorded(day), FINER).map for day in (YESTERDAY, TODAY))
+    before = [keyframe.T_world_camera for keyframe in b.keyframes.values()]
+    assert lay_over(a, b) is None
+    for keyframe, T in zip(b.keyframes.values(), before, strict=True):
+        np.testing.assert_array_equal(keyframe.T_world_camera, T)
+    assert not things(a, b)
+    assert lay_over(LogOddsMap(0.1), b) is None
+    assert lay_over(a, MRFMap(0.1)) is None

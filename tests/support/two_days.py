@@ -42,7 +42,7 @@ def room_frames(added: tuple[Solid, ...] = (), name: str = "frame", around: int 
     """The first frames of so many ``around`` the room, with things ``added`` to its furniture, and noise."""
     scene = Scene(translated([*room_solids(), *added], ROOM_IN_WORLD), light=(0.0, 0.0, 1.0))
     random, frames = np.random.default_rng(0), []
-    for index in range(2 * COUNT):
+    for index in range(around):
         T = camera_pose(index / around)
         depth_m = ray_depths(scene, CAMERA, T)
         noisy = depth_m + random.normal(0, SIGMA_M, depth_m.shape) * (depth_m > 0)

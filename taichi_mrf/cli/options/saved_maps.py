@@ -98,8 +98,9 @@ class Info:
 class Diff:
     """Compare two saved maps voxel by voxel: which states have changed, and by how much probabilities differ.
 
-    The maps can be of different methods, but their voxels must be of one size. The exit status is 0 whether
-    they differ or not. Example: taichi-mrf diff monday.npz tuesday.npz --out changes.ply
+    B is located in A first if its world is another. What appeared and what left is listed. The maps can be of
+    different methods, but their voxels must be of one size. The exit status is 0 whether they differ or not.
+    Example: taichi-mrf diff monday.npz tuesday.npz --out changes.ply
     """
 
     a: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
