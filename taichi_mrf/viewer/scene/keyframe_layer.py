@@ -28,6 +28,9 @@ LEAST_TO_MERGE = 4096
 """From this number on, the bricks that dropped keyframes crossed are merged."""
 
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
+_PALE = {"on": (166, 209, 213), "off": (220, 220, 220), "frozen": (184, 197, 233)}
+"""The colours of keyframes of an earlier map."""
+
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
 CLOSED = 3.0
@@ -203,7 +206,7 @@ class KeyframeLayer:
             name,
             keyframe.T_world_camera,
             keyframe.camera,
-            _CHOSEN if is_chosen else _COLORS[keyframe.state],
+            _CHOSEN if is_chosen else (_PALE if keyframe.earlier else _COLORS)[keyframe.state],
             thickness=3.0 if is_chosen else 1.5,
             picture=picture if flat else None,
         )
