@@ -162,6 +162,10 @@ def _posed(read: ReadFrame, count: int, endless: bool = False) -> Iterator[list[
                 frame = read(index)
             except FrameError:
                 continue
+            except DatasetError:
+                if not part:
+                    raise
+                break  # nothing more comes, but there is something
             if _tells_more(part, frame):
                 part.append(frame)
             stands = endless and bool(part) and frame.stamp - part[-1].stamp > STANDS_S

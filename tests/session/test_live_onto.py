@@ -2,21 +2,26 @@
 page as in a batch run."""
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from console import as_process, assert_refused, complaints, taichi_mrf
+from inputs_bags import Bag, write_bag
 from live_scene import FakeLink, assert_shown_is, finished, last_status, marginals, never, shown
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.base import EndlessNames
+from taichi_mrf.datasets.wires import robot as wired
+from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.mapping.onto import placed_in
@@ -242,6 +247,54 @@ def test_the_frames_that_locate_a_robot_are_mapped_too_and_once(days: Days) -> N
         assert frame.stamp > max(keyframe.stamp_s for keyframe in m.keyframes.values())
     assert names == [f"2:{frame.name}" for frame in frames()[1::2]]
     assert list(placed.located.frames) == [frame.name for frame in frames()[1::2][:located_by]]
+
+
+def walk(bag: Bag) -> None:
+    """Today's frames as a robot sends them, each between two poses."""
+    today = frames()[1::2]
+    bag.camera_info("/camera/camera_info", "optical", today[0].camera)
+    bag.tf("/tf_static", 0.0, "camera", "optical", np.eye(4))
+    for i, frame in enumerate(today):
+        T = away() @ frame.T_world_camera
+        bag.tf("/tf", 0.97 + 0.1 * i, "map", "camera", T)
+        bag.image("/camera/depth", 1 + 0.1 * i, "optical", frame.depth_m.astype(np.float32), "32FC1")
+        bag.tf("/tf", 1.03 + 0.1 * i, "map", "camera", T)
+
+
+def test_a_robot_goes_on_in_the_map_once_it_is_located(
+    days: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+    from foxglove_robot import robot
+
+    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
+    said: list[str] = []
+    with robot(write_bag(tmp_path, walk, kind="mcap")) as sender:
+
+        def send() -> None:
+            sender.wait_for("/camera/depth", "/tf", "/tf_static")
+            sender.send_next(5)
+            assert wait_until(lambda: said, 60)
+            while sender.sent < len(sender.messages):
+                sender.send_next(3)
+                time.sleep(0.2)
+
+        thread = Thread(target=send)
+        thread.start()
+        few = AT_ONCE | {"limit": 3}
+        source, notes = open_source(sender.source, CONFIG, onto=days.map, wait_for=said.append, **few)
+        thread.join()
+    assert said == [f"waiting for views by which {sender.source} is located in {days.map}"]
+    assert any(note.startswith(f"Located in {days.map}: ") for note in notes)
+    session = Session(source, FakeLink(), Policy(leave_when_done=True))
+    joined = list(finished(session).keyframes.values())[COUNT // 2 :]
+    dataset: Any = source.dataset
+    first = dataset.located.frames[:3]
+    assert [keyframe.name for keyframe in joined] == [f"2:{name}" for name in first]
+    truth = np.stack([frame.T_world_camera for frame in frames()[1::2]])
+    for keyframe in joined:
+        off_m = np.linalg.norm(truth[:, :3, 3] - keyframe.T_world_camera[:3, 3], axis=1)
+        assert off_m.min() < 0.05
 
 
 def test_a_robot_that_stands_still_is_located_by_what_it_sees(days: Days) -> None:

@@ -28,13 +28,15 @@ LEAST_TO_MERGE = 4096
 """From this number on, the bricks that dropped keyframes crossed are merged."""
 
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
-_PALE = {"on": (166, 209, 213), "off": (220, 220, 220), "frozen": (184, 197, 233)}
-"""The colours of keyframes of an earlier map."""
-
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
+
+
+def pale(color: ArrayLike) -> NDArray[np.uint8]:
+    """Colours of a keyframe of an earlier map: RGB (..., 3), half way to white."""
+    return (np.asarray(color, np.uint8) // 2 + 128).astype(np.uint8)
 
 
 def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -201,12 +203,15 @@ class KeyframeLayer:
             self._places[id] = self._free_places.pop() if self._free_places else len(self._places)
         name = self._name(id)
         picture = keyframe.picture if self._pictures and keyframe.state != "off" else None
+        color = _COLORS[keyframe.state]
+        if keyframe.earlier:
+            color, picture = tuple(pale(color).tolist()), None if picture is None else pale(picture)
         flat = isinstance(keyframe.camera, PinholeCamera)
         self._outline(
             name,
             keyframe.T_world_camera,
             keyframe.camera,
-            _CHOSEN if is_chosen else (_PALE if keyframe.earlier else _COLORS)[keyframe.state],
+            _CHOSEN if is_chosen else color,
             thickness=3.0 if is_chosen else 1.5,
             picture=picture if flat else None,
         )
