@@ -30,6 +30,7 @@ from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.queries.points import FREE
 from taichi_mrf.sensor.frame import Frame
 
 EVERYWHERE = np.full(3, np.inf)
@@ -103,7 +104,9 @@ def whole_map(m: MRFMap) -> WholeMap:
     surface = m.aligner.surface.around(-EVERYWHERE, EVERYWHERE)
     walls = walls_of(surface, [m.aligner.surface.of([id]) for id in m.keyframes])
     cameras_m = np.stack([keyframe.T_world_camera[:3, 3] for keyframe in m.keyframes.values()])
-    return WholeMap(surface, walls, cameras_m, up_vector(m.up))
+    return WholeMap(
+        surface, walls, cameras_m, up_vector(m.up), lambda points: m.marginals.state(points) == FREE
+    )
 
 
 def frame_of(keyframe: Keyframe) -> Frame:
