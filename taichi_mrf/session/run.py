@@ -214,7 +214,7 @@ class Run(SessionCore):
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:
-            name = self.source.choice.get("onto", self.source.name)
+            name = self.source.choice.get("onto") or self.source.name
             self.send(Notice(saved_unsettled(name), "warning"))
         for entry in self.mapper.roster.entries.values():
             self.send(self.mapper.describe(entry))

@@ -226,10 +226,9 @@ def open_source(
     def new_replay() -> Replay:
         return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=unread, speed=speed)
 
-    choice: dict[str, Any] = {"every": every, "limit": limit}
-    if onto is not None:
-        choice |= {"onto": str(onto), "frozen_before": frozen}
-    choice |= {"track_poses": track, "poses_from": poses, "follow": follow or None}
+    joined = {"onto": onto and str(onto), "frozen_before": frozen or None}
+    chosen = {"every": every, "limit": limit, **joined}
+    choice = {**chosen, "track_poses": track, "poses_from": poses, "follow": follow or None}
     if learnt is not None:
         choice["noise_from"] = "auto"
     notes = dataset.notes + noise_notes(config.sensor, None, learnt)
