@@ -326,6 +326,12 @@ class Rules:
     loop_loss: float = 0.1
     """Log-likelihood of the depth around a loop's ends that closing it may cost."""
 
+    merged_m: float = 0.01
+    """Standard deviation, in metres along each axis, of a keyframe's place in a map that is merged."""
+
+    merged_rad: float = 0.005
+    """Standard deviation of its turn about each axis."""
+
     least_motion: float = 0.02
     """Voxels by which what a keyframe sees has to move at least, or it stays."""
 

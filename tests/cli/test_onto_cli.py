@@ -80,3 +80,21 @@ def test_frozen_needs_a_map_and_the_map_has_to_be_one(tmp_path: Path) -> None:
     assert_refused(taichi_mrf("map", TODAY, "--frozen", "--out", tmp_path / "out"), "add --onto MAP")
     done = taichi_mrf("map", TODAY, "--onto", tmp_path / "none.npz", "--out", tmp_path / "out")
     assert_refused(done, "none.npz")
+
+
+def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:
+    done = taichi_mrf("map", TODAY, "--out", tmp_path / "today", *FAST)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "both.npz"
+    done = as_process("merge", yesterday, tmp_path / "today" / MAP_FILE, "--out", out)
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert "% of what is seen agrees" in said
+    assert "40 keyframes, " in said
+    assert len(tm.load_map(out).keyframes) == 40
+    again = taichi_mrf("merge", yesterday, tmp_path / "today" / MAP_FILE, "--out", out, "--json")
+    facts = json.loads(again.stdout)
+    assert facts["keyframes"] == 40
+    assert facts["loops"] > 5
+    assert_refused(taichi_mrf("merge", yesterday, "--out", out), "two maps or more")
+    assert_refused(taichi_mrf("merge", yesterday, yesterday, "--out", tmp_path / "out.ply"), ".npz")

@@ -15,7 +15,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import inverse, tangent_norms
 from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.onto import Placed, frame_of, locate, parameters_onto, placed_in
+from taichi_mrf.mapping.onto import Placed, locate, parameters_onto, placed_in
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -178,16 +178,6 @@ def test_maps_that_align_nothing_are_refused(saved: Path) -> None:
     today = where_it_is(recorded(TODAY), m)
     with pytest.raises(ConfigError, match=r"poses\.refine"):
         map_sequence(today, refined, onto=m)
-
-
-def test_a_keyframe_is_the_frame_that_it_was(saved: Path) -> None:
-    m = tm.load_map(saved)
-    again = MRFMap.from_config(CONFIG, recorded(TODAY).camera)
-    for keyframe in m.keyframes.values():
-        again.add(frame_of(keyframe))
-    again.infer()
-    assert_same_map(m, again)
-    assert [k.name for k in again.keyframes.values()] == [k.name for k in m.keyframes.values()]
 
 
 def test_the_parameters_are_those_of_the_map() -> None:
