@@ -8,7 +8,7 @@ asks for, takes the next frame if one is due, infers, and sends what has changed
 """
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -19,13 +19,14 @@ if __name__ == "__main__":  # the command line parses the options, and calls the
     sys.exit(start("live"))
 
 from taichi_mrf.cli.map_page import MapPage
+from taichi_mrf.cli.options.config_file import live_defaults
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, print_problem
 from taichi_mrf.config.schema import with_absolute_tables
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, CutShortError
 from taichi_mrf.runs.files import holds_run
 
 
@@ -48,13 +49,16 @@ def run_live(options: Live) -> int:
         bar = ProgressBar(console, options.printing)
         page = MapPage(options, print_line, bar, stack)
         tell_first_run(options.printing)
+        from taichi_mrf.cli.map.task import settings_onto
         from taichi_mrf.cli.shared.learn_noise import learn_with_bar
         from taichi_mrf.runs.folder import NO_HASTE, write_run
         from taichi_mrf.session.session import Session
         from taichi_mrf.session.session_core import Policy
         from taichi_mrf.session.source import open_among, open_source
 
-        # The source: a recording or a camera with an empty map, or a saved map.
+        # The source: a recording or a camera with an empty map or that of an earlier day, or a saved map.
+        if options.onto is not None:
+            settings = settings_onto(options.onto, settings, live_defaults())
         learn = partial(
             learn_with_bar,
             console=console,
@@ -75,8 +79,15 @@ def run_live(options: Live) -> int:
             poses=options.poses.file,
             follow=options.poses.follow,
             learn_noise=learn if options.noise.is_learnt else None,
+            onto=options.onto,
+            frozen=options.frozen,
+            wait_for=page.wait_for,
         )
-        source, notes = open_among(options.source, open_one)
+        try:  # nothing is kept of a robot that has not been located
+            with nullcontext() if options.onto is None else request.cutting_short():
+                source, notes = open_among(options.source, open_one)
+        except CutShortError:
+            return request.exit_status
         if source.among is not None and options.out is not None:
             raise ConfigError(
                 f"{options.source}: holds several recordings, and --out takes the files of one: pass one of "

@@ -10,7 +10,7 @@ from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, prin
 from taichi_mrf.cli.shared.terminal import print_problem
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.session.link import ViewerLink
-from taichi_mrf.viewer.messages import Listening, Status, Update
+from taichi_mrf.viewer.messages import Listening, Notice, Status, Update
 
 SHORTEST_LIFE_SECONDS = 30.0
 """A viewer that lives shorter than this is not restarted."""
@@ -34,6 +34,11 @@ class MapPage:
         wants_browser = self._options.open and not self._has_listened
         print_address(where, "The map", self._wanted_port, wants_browser, self._print_line)
         self._has_listened, self._wanted_port = True, where.port
+
+    def wait_for(self, text: str) -> None:
+        """Tell the user what is waited for before there is a map."""
+        self._print_line(text)
+        self.link.send(Notice(text))
 
     def starts_again(self, request: StopRequest) -> bool:
         """Look why a session has ended; returns True if its viewer was killed, and another was started for it

@@ -6,6 +6,7 @@ had been taken in the same run.
 """
 
 import itertools
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -70,12 +71,16 @@ ReadFrame = Callable[[int], Frame]
 
 
 def locate(
-    m: OccupancyMap, frames: Sequence[Frame] | Dataset, T_map_recording: Pose | None = None
+    m: OccupancyMap,
+    frames: Sequence[Frame] | Dataset,
+    T_map_recording: Pose | None = None,
+    keep: Callable[[Frame], object] = lambda frame: None,
 ) -> LocatedRecording:
     """Find a recording in a map whose keyframes were taken in the same place at another time.
 
     ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
-    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. The answer
+    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. ``keep`` is
+    called with each frame that is searched for: those of an endless dataset are not read again. The answer
     has ``T_map_recording``, or None and a ``reason``. Raises ConfigError if keyframes cannot be aligned in a
     map of this method, or if the map has none, and what reading frames raises.
     """
@@ -85,7 +90,7 @@ def locate(
             f"not {m.METHOD.name}"
         )
     whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
-    for stretch, names in _stretches(m, frames):
+    for stretch, names in _stretches(m, frames, keep):
         now = replace(locate_stretch(stretch, whole, T_map_recording), frames=names)
         if now.T_map_recording is not None:
             return now
@@ -108,13 +113,19 @@ def whole_map(m: MRFMap) -> WholeMap:
     )
 
 
-def _stretches(m: MRFMap, frames: Sequence[Frame] | Dataset) -> Iterator[tuple[Stretch, tuple[str, ...]]]:
+def _stretches(
+    m: MRFMap, frames: Sequence[Frame] | Dataset, keep: Callable[[Frame], object]
+) -> Iterator[tuple[Stretch, tuple[str, ...]]]:
     """Stretches of a recording, from its beginning and from further on, with the names of their frames."""
-    if isinstance(frames, Dataset) and (frames.tracked or frames.endless):
-        parts: Iterator[list[Frame]] = _tracked(m, frames)
+    if not isinstance(frames, Dataset):
+        parts = _posed(frames.__getitem__, len(frames))
+    elif frames.tracked:
+        parts = _tracked(m, frames)
     else:
-        parts = _posed(frames.read if isinstance(frames, Dataset) else frames.__getitem__, len(frames))
+        parts = _posed(frames.read, len(frames), endless=frames.endless)
     for part in parts:
+        for frame in part:
+            keep(frame)
         images = [_image(m, frame) for frame in part]
         stretch = Stretch(images, [frame.T_world_camera for frame in part], m.sensor.max_depth)
         yield stretch, tuple(frame.name for frame in part)
@@ -125,11 +136,17 @@ def _image(m: MRFMap, frame: Frame) -> DepthImage:
     return DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
 
 
-def _posed(read: ReadFrame, count: int) -> Iterator[list[Frame]]:
-    """Frames of a recording that has poses, in stretches that begin all along it. Broken frames are left
-    out."""
-    last = -1
-    for first in np.unique(np.linspace(0, count, RULES.whole_stretches, endpoint=False).astype(int)):
+STANDS_S = 10.0
+"""An endless recording whose view has not changed for so long, in seconds of its stamps, is searched for by
+what there is."""
+
+
+def _posed(read: ReadFrame, count: int, endless: bool = False) -> Iterator[list[Frame]]:
+    """Frames of a recording that has poses, in stretches that begin all along it, or as they come if it is
+    ``endless``. Broken frames are left out."""
+    last, ends = -1, 0 if endless else count
+    firsts = np.linspace(0, ends, RULES.whole_stretches, endpoint=False).astype(int)
+    for first in firsts if endless else np.unique(firsts):
         part: list[Frame] = []
         for index in range(max(last + 1, int(first)), count):
             last = index
@@ -137,9 +154,14 @@ def _posed(read: ReadFrame, count: int) -> Iterator[list[Frame]]:
                 frame = read(index)
             except FrameError:
                 continue
+            except DatasetError:
+                if not part:
+                    raise
+                break  # nothing more comes, but there is something
             if _tells_more(part, frame):
                 part.append(frame)
-            if len(part) == RULES.whole_frames:
+            stands = endless and bool(part) and frame.stamp - part[-1].stamp > STANDS_S
+            if len(part) == RULES.whole_frames or stands:
                 break
         if part:
             yield part
@@ -176,13 +198,16 @@ def _tracked(m: MRFMap, dataset: Dataset) -> Iterator[list[Frame]]:
 def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
     """The frames of a dataset in the world of a map, with names that the map does not have, and later than
     its newest keyframe if their clock begins before it. Raises DatasetError if the dataset is not found in
-    the map, which is called ``name``."""
-    located = locate(m, dataset)
+    the map, which is called ``name``, or is a camera without poses that cannot be read twice."""
+    if dataset.tracked and dataset.endless:
+        raise DatasetError(f"{dataset.name}: --onto needs a recording of it, or a camera that has poses")
+    kept = deque[Frame]()
+    located = locate(m, dataset, kept.append if dataset.endless else lambda frame: None)
     if located.T_map_recording is None:
         raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
     notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]
     newest_s = max(keyframe.stamp_s for keyframe in m.keyframes.values())
-    first_s = newest_s if dataset.endless else float(dataset.stamps()[0])
+    first_s = kept[0].stamp if kept else float(dataset.stamps()[0])
     later_s = newest_s + NEXT_S - first_s if first_s < newest_s else 0.0
     if later_s:
         notes.append(f"Its clock begins before the newest keyframe of {name}: {later_s:.0f} s are added.")
@@ -197,6 +222,7 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
         prefix=free_prefix(m, () if dataset.endless else dataset.frame_names),
         later_s=later_s,
         map_origin_m=np.asarray(m.config.volume.origin),
+        kept=kept,
     )
 
 
@@ -218,13 +244,19 @@ NEXT_S = 1.0
 class Placed(Derived):
     """The frames of ``source`` in the world of a map, where they were ``located``.
 
-    ``prefix`` goes before their names, and ``later_s`` is added to their stamps.
+    ``prefix`` goes before their names, and ``later_s`` is added to their stamps. ``kept`` are the first
+    frames of an endless source, which was located by them.
     """
 
     located: LocatedRecording = field(kw_only=True)
     prefix: str = field(kw_only=True)
     later_s: float = field(kw_only=True)
     map_origin_m: NDArray[np.float64] = field(kw_only=True)
+    kept: deque[Frame] = field(kw_only=True, default_factory=deque)
+
+    def awaiting(self) -> str:
+        """What the source waits for, once the frames that were kept are read."""
+        return "" if self.kept else self.source.awaiting()
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -263,7 +295,7 @@ class Placed(Derived):
 
     def read(self, index: int) -> Frame:
         """The source's frame, in the map. Raises what the source raises."""
-        frame = self.source.read(index)
+        frame = self.kept.popleft() if self.kept else self.source.read(index)
         return replace(
             frame,
             T_world_camera=self.T_map_recording @ frame.T_world_camera,

@@ -138,14 +138,14 @@ class SequenceRun:
             self._intake.refiner.repeat(resume_from.keyframes.values())
         self._follower = follower_of(m, dataset, config.poses)
         self.result = self._intake.result
-        self.result.before = 0 if onto is None else _keyframes_in(onto)
+        self.result.before = 0 if onto is None else keyframes_in(onto)
         self.result.followed = None if self._follower is None else self._follower.done
 
     def add_keyframes(self) -> None:
         """Offer every frame that is not in the map already. Raises FrameError for an unreadable frame unless
         ``skip_bad_frames``, DatasetError if no frame became a keyframe, and what the map raises."""
         self._offer_frames()
-        if _keyframes_in(self.result.map) == self.result.before:
+        if keyframes_in(self.result.map) == self.result.before:
             raise DatasetError(_why_empty(self._dataset, self.result))
 
     def settle(self) -> None:
@@ -309,7 +309,7 @@ def check_same_frames(
             )
 
 
-def _keyframes_in(m: OccupancyMap) -> int:
+def keyframes_in(m: OccupancyMap) -> int:
     """Number of a map's keyframes, frozen ones among them."""
     return len(m.keyframes) + (len(m.frozen) if can_freeze(m) else 0)
 

@@ -20,6 +20,7 @@ class EditHistory:
     def __init__(self) -> None:
         self._presses: list[list[Pair]] = []
         self._done = 0
+        self._joined: list[Pair] = []
 
     @property
     def can_undo(self) -> bool:
@@ -37,6 +38,15 @@ class EditHistory:
             self._presses[self._done :] = [press]
             self._done += 1
 
+    def join(self, pair: Pair) -> None:
+        """Note a keyframe that has joined the map of an earlier recording: all of them are taken back at
+        once."""
+        if any(press is self._joined for press in self._presses[: self._done]):
+            self._joined.append(pair)
+        else:
+            self._joined = [pair]
+            self.note(self._joined)
+
     def next(self, again: bool) -> list[Edit]:
         """The edits that take the last press back, or make the next one ``again``; empty if there is none."""
         if again:
@@ -49,6 +59,7 @@ class EditHistory:
 
     def forget(self, keyframes: Collection[int]) -> None:
         """Edits of these keyframes can no longer be taken back."""
-        left = [[pair for pair in press if pair[1].keyframe not in keyframes] for press in self._presses]
-        self._done = sum(map(bool, left[: self._done]))
-        self._presses = [press for press in left if press]
+        for press in self._presses:
+            press[:] = [pair for pair in press if pair[1].keyframe not in keyframes]
+        self._done = sum(map(bool, self._presses[: self._done]))
+        self._presses = [press for press in self._presses if press]

@@ -42,7 +42,8 @@ MOST_POINTS = 200_000
 class LiveKeyframe:
     """One keyframe. ``map_id`` is its number in the map while it is on. While it is off, ``depth_m`` (H, W)
     is its depth image in metres, 0 for no measurement, ``color`` (H, W, 3) its colour image, if it has one,
-    and ``own`` what it states of its measurements. A frozen keyframe has none of them.
+    and ``own`` what it states of its measurements. A frozen keyframe has none of them. ``earlier``: it is of
+    the map that the recording has joined.
 
     ``T_recorded`` is the recorded pose and ``T_home`` the one found by alignment, which is the same if poses
     are not refined; ``moved_by_hand``: a user has moved it elsewhere.
@@ -62,6 +63,7 @@ class LiveKeyframe:
     color: NDArray[np.uint8] | None = None
     own: OwnEvidence = NOTHING
     moved_by_hand: bool = False
+    earlier: bool = False
 
     def __post_init__(self) -> None:
         self.T_recorded = self.T_home = self.T_world_camera
@@ -118,24 +120,28 @@ class Mapper:
     """
 
     def __init__(
-        self, m: OccupancyMap, first_id: int = 0, refiner: PoseRefiner | None = None, own: bool = False
+        self,
+        m: OccupancyMap,
+        first_id: int = 0,
+        refiner: PoseRefiner | None = None,
+        own: bool = False,
+        joined: bool = False,
     ) -> None:
         """A map that may have keyframes already; the viewer's numbers begin at ``first_id``. ``refiner``
         refines the map's poses, None if they stay. ``own``: another program makes the map; else one that has
-        keyframes comes from a file."""
-        self.map, self.refiner = m, refiner
+        keyframes comes from a file. ``joined``: those are of an earlier recording, and frames follow."""
+        self.map, self.refiner, self._joined = m, refiner, joined
         self.inferred: InferReport | None = None
         self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
-            self.roster.add(
-                keyframe, keyframe.rays, thumbnail(keyframe.camera, keyframe.depth_m), id, keyframe.stamp_s
-            )
+            picture = thumbnail(keyframe.camera, keyframe.depth_m)
+            self.roster.add(keyframe, keyframe.rays, picture, id, keyframe.stamp_s).earlier = joined
         # A map from a file has beliefs but no messages; an edit needs full inference first.
         from_file = bool(m.keyframes) and not own
         self.lacks_messages = from_file and has_messages(m)
         self.saved_unsettled = from_file and not m.settled
         self.unsettled = self.saved_unsettled or self.stale
-        self.shown = ShownMap(m, opened=self.lacks_messages and not self.unsettled)
+        self.shown = ShownMap(m, opened=self.lacks_messages and not (self.unsettled or joined))
         self.edited = False
         self.edits = EditHistory()
         self.unaligned = False
@@ -174,6 +180,8 @@ class Mapper:
             frame, added.rays, thumbnail(frame.camera, frame.depth_m), added.keyframe, frame.stamp
         )
         entry.T_world_camera = entry.T_home = self.map.keyframes[added.keyframe].T_world_camera
+        if self._joined:
+            self.edits.join((messages.Switch(entry.id, False), messages.Switch(entry.id, True)))
         return entry
 
     def sweep(self, map_id: int) -> None:
@@ -423,4 +431,5 @@ class Mapper:
             picture,
             crossed,
             entry.T_home,
+            entry.earlier,
         )

@@ -10,6 +10,7 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
+from taichi_mrf.mapping.pipeline import keyframes_in
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import (
     can_freeze,
@@ -184,7 +185,9 @@ class Run(SessionCore):
         if replay is not None and self.replay is not None:
             replay.set_speed(self.replay.speed)
         self.source, self.intake, self.replay = source, intake, replay
-        self.mapper = Mapper(intake.map, first_id, intake.refiner, source.own)
+        joined = bool(source.located)
+        intake.result.before = keyframes_in(m) if joined else 0
+        self.mapper = Mapper(intake.map, first_id, intake.refiner, source.own, joined)
         self.follower = follower_of(m, source.dataset, source.config.poses)
         intake.result.followed = None if self.follower is None else self.follower.done
         self.progress = Progress()
@@ -207,10 +210,12 @@ class Run(SessionCore):
                 has_frames=self.source.new_replay is not None,
                 recordings=() if among is None else among.names,
                 recording=self.source.place,
+                located=self.source.located,
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:
-            self.send(Notice(saved_unsettled(self.source.name), "warning"))
+            name = self.source.choice.get("onto") or self.source.name
+            self.send(Notice(saved_unsettled(name), "warning"))
         for entry in self.mapper.roster.entries.values():
             self.send(self.mapper.describe(entry))
         if self.current is not None:

@@ -4,6 +4,7 @@ One thread does all of it, one piece of work after the other, because Taichi may
 
     requests that have arrived
     keyframes whose poses have changed         if poses follow a file: move and show some of them
+    full inference, if frames are to join an earlier map that is not inferred
     a frame, if one is due                     track its pose if it has none, add it, align it if poses are
                                                refined, sweep it once, then the keyframes whose cavity has
                                                changed; publish the changes
@@ -113,7 +114,8 @@ class Session:
         """Do the next piece of work; returns whether there was any."""
         state, mapper = self.state, self.state.mapper
         moved = self._follow()
-        if mapper.stale and mapper.unsettled:
+        # Keyframes of an earlier map send their messages before others join them.
+        if (mapper.stale and mapper.unsettled) or (mapper.lacks_messages and state.is_replaying):
             return self._settle()
         if state.replay is not None and state.is_replaying and self._is_due(state.replay):
             self._take_frame(state.replay)

@@ -20,7 +20,9 @@ from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance, mistakes
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.mapping.intake import hold_out_of
+from taichi_mrf.mapping.onto import Placed, placed_in
 from taichi_mrf.mapping.tracking import wants_color
+from taichi_mrf.methods.capabilities import can_freeze
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -64,6 +66,12 @@ class Source:
     own: bool = False
     among: "Recordings | None" = None
     place: int = 0
+
+    @property
+    def located(self) -> str:
+        """How sure the place of the recording is in the map of an earlier one, in words; empty if the map is
+        its own."""
+        return self.dataset.located.in_words() if isinstance(self.dataset, Placed) else ""
 
     @property
     def hold_out(self) -> int:
@@ -157,10 +165,15 @@ def open_source(
     poses: str | None = None,
     follow: bool = False,
     learn_noise: LearnNoise | None = None,
+    onto: Path | None = None,
+    frozen: bool = False,
+    wait_for: Callable[[str], None] = lambda text: None,
 ) -> Opened:
     """Start Taichi and open a source, read as ``reading`` says; returns it with notes for the user. With
     ``track`` the poses of its frames are found by tracking, with ``poses`` they come from that file, and
-    ``follow`` it as it changes. ``learn_noise`` learns sigma before a recording is mapped.
+    ``follow`` it as it changes. ``learn_noise`` learns sigma before a recording is mapped. With ``onto`` the
+    frames are located in that saved map, whose parameters ``config`` has, and join it; its keyframes are kept
+    ``frozen`` on demand. ``wait_for`` is told, in words, what a source that runs is waited for.
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
@@ -175,6 +188,8 @@ def open_source(
             raise ConfigError(
                 f"{path}: is a saved map, which keeps its noise: --noise auto is for a recording"
             )
+        if onto is not None:
+            raise ConfigError(f"{path}: is a saved map: --onto is for a recording")
         with open_map_file(path) as file:
             header, parked = read_header(path, file), "parked" in file
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
@@ -191,22 +206,40 @@ def open_source(
     dataset = open_posed(name, poses, follow=follow, track=track, color=color, **keywords)
     if not config.color and METHODS[config.method].has_colors:
         note_unused_color(dataset, name, reading or SourceFlags())
-    config = with_recorded_noise(config, dataset)
+    if onto is None:
+        config = with_recorded_noise(config, dataset)
     found = mistakes(dataset) if doubtful_at_a_glance(dataset) else []
     dataset.notes += [f"frames contradict each other: {'; '.join(found)}"] if found else []
     learnt = None if learn_noise is None else learn_noise(dataset, config)
     if learnt is not None:
         config = learnt.put_into(config)
+    new_map: Callable[[], OccupancyMap] = partial(create_map, config, dataset.camera)
+    if onto is not None:
+        if dataset.endless:
+            wait_for(f"waiting for views by which {name} is located in {onto}")
+        m = load_map(onto, config.volume.memory_limit_gb)
+        dataset = placed_in(m, str(onto), dataset)
+        new_map = partial(_earlier_map, [m], onto, config, frozen)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)
 
     def new_replay() -> Replay:
         return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=unread, speed=speed)
 
-    new_map = partial(create_map, config, dataset.camera)
-    chosen = {"every": every, "limit": limit}
+    joined = {"onto": onto and str(onto), "frozen_before": frozen or None}
+    chosen = {"every": every, "limit": limit, **joined}
     choice = {**chosen, "track_poses": track, "poses_from": poses, "follow": follow or None}
     if learnt is not None:
         choice["noise_from"] = "auto"
     notes = dataset.notes + noise_notes(config.sensor, None, learnt)
     return Source(name, config, new_map, new_replay, dataset.tracked, dataset, choice, learnt), notes
+
+
+def _earlier_map(loaded: list[OccupancyMap], path: Path, config: Config, frozen: bool) -> OccupancyMap:
+    """The saved map that a recording joins, at first the one that is ``loaded``; with ``frozen`` all its
+    keyframes are."""
+    m = loaded.pop() if loaded else load_map(path, config.volume.memory_limit_gb)
+    if frozen and can_freeze(m):
+        for id in list(m.keyframes):
+            m.freeze_keyframe(id)
+    return m

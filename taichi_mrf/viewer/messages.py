@@ -70,6 +70,8 @@ class Hello(Update):
     recordings: tuple[str, ...] = ()
     """Names of all that can be mapped instead, with ``recording``, the place of the source among them."""
     recording: int = 0
+    located: str = ""
+    """How sure the place of the frames is in the map of an earlier recording; empty if the map is theirs."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ class KeyframeInfo(Update):
     ``picture`` is a small depth image in colours, (h, w, 3) uint8. If ``camera`` is no pinhole, it is that of
     the picture's pixels; ``crossed`` (n, 3) int32 are the bricks
     that its rays cross, which are free where the map has no voxels. ``T_home`` is the pose that *Put back*
-    restores.
+    restores. ``earlier``: it is of the map that the recording has joined.
     """
 
     id: int
@@ -154,6 +156,7 @@ class KeyframeInfo(Update):
     picture: NDArray[np.uint8]
     crossed: NDArray[np.int32]
     T_home: Pose
+    earlier: bool = False
 
 
 @dataclass(frozen=True)

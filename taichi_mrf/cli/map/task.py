@@ -100,10 +100,16 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
     start = Path.cwd()
     settings = with_absolute_tables(options.poses.parameters(options.settings), start)
     if options.onto is not None:
-        with open_map_file(options.onto) as file:
-            of_map = read_header(options.onto, file).config
-        settings = parameters_onto(of_map, settings, Config(), str(options.onto))
+        settings = settings_onto(options.onto, settings, Config())
     return MapTask(replace(options, sources=(source,), out=out, settings=settings), start)
+
+
+def settings_onto(onto: Path, asked: Config, default: Config) -> Config:
+    """The parameters with which a recording goes on in a saved map (:func:`.parameters_onto`). Raises
+    MapFileError, and ConfigError for others that are asked for."""
+    with open_map_file(onto) as file:
+        of_map = read_header(onto, file).config
+    return parameters_onto(of_map, asked, default, str(onto))
 
 
 def refuse_other_run(task: MapTask) -> dict[str, Any] | None:

@@ -8,7 +8,15 @@ import tyro
 
 from taichi_mrf.cli.options.config_file import live_defaults
 from taichi_mrf.cli.options.publish import PublishFlags
-from taichi_mrf.cli.options.shared import NoiseFlags, PoseFlags, Reading, Verbosity, check_least, check_port
+from taichi_mrf.cli.options.shared import (
+    NoiseFlags,
+    PoseFlags,
+    Reading,
+    Verbosity,
+    check_least,
+    check_onto,
+    check_port,
+)
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -34,6 +42,13 @@ class Live:
 
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace the run that DIR holds. Without it, a folder that holds a run is refused."""
+
+    onto: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
+    """Go on with the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
+    keyframes join those of the map. A SOURCE that is not found there for sure is refused."""
+
+    frozen: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """With --onto: keep the earlier keyframes as evidence only, without their images."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
@@ -89,7 +104,8 @@ class Live:
         if not 0 <= self.speed < float("inf"):
             raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
         check_port(self.port)
-        self.noise.refuse_with(track_poses=self.poses.track_poses)
+        self.noise.refuse_with(track_poses=self.poses.track_poses, onto=self.onto)
+        check_onto(self.onto, self.frozen, self.poses)
 
 
 @dataclass(frozen=True)

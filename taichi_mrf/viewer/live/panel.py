@@ -192,6 +192,7 @@ class Panel(BasePanel):
         self._numbers.content = rows_html(
             {
                 "source": h.source,
+                **({"located": h.located} if h.located else {}),
                 "method": h.method,
                 "backend": f"{h.backend} ({h.device})",
                 "voxel size": f"{100 * h.voxel_size:g} cm",
@@ -218,7 +219,10 @@ class Panel(BasePanel):
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
-        self._names = {f"{each.id}: {each.name} ({each.state})": each.id for each in listed}
+        earlier = {True: "earlier, ", False: ""}
+        self._names = {
+            f"{each.id}: {each.name} ({earlier[each.earlier]}{each.state})": each.id for each in listed
+        }
         self.keyframe.options = list(self._names) or [NO_KEYFRAME]
         before, self._all = self._all, (float(min(keyframes, default=0)), float(max(keyframes, default=0)))
         if self.range.value == before:  # as long as nobody has chosen another

@@ -34,6 +34,11 @@ CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
 
+def pale(color: ArrayLike) -> NDArray[np.uint8]:
+    """Colours of a keyframe of an earlier map: RGB (..., 3), half way to white."""
+    return (np.asarray(color, np.uint8) // 2 + 128).astype(np.uint8)
+
+
 def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A pose as viser takes it: the rotation as a unit quaternion, w first, and the position in metres."""
     wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
@@ -198,12 +203,15 @@ class KeyframeLayer:
             self._places[id] = self._free_places.pop() if self._free_places else len(self._places)
         name = self._name(id)
         picture = keyframe.picture if self._pictures and keyframe.state != "off" else None
+        color = _COLORS[keyframe.state]
+        if keyframe.earlier:
+            color, picture = tuple(pale(color).tolist()), None if picture is None else pale(picture)
         flat = isinstance(keyframe.camera, PinholeCamera)
         self._outline(
             name,
             keyframe.T_world_camera,
             keyframe.camera,
-            _CHOSEN if is_chosen else _COLORS[keyframe.state],
+            _CHOSEN if is_chosen else color,
             thickness=3.0 if is_chosen else 1.5,
             picture=picture if flat else None,
         )
