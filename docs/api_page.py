@@ -37,6 +37,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "compare_maps",
     ),
     "While it is made": ("live", "publish", "show"),
+    "Another day": ("locate", "merge"),
     "Files": ("open_dataset", "load_map", "ChunkedMap", "take_part", "export_map", "ExportOptions"),
     "Evaluation": ("accuracy",),
     "Configuration": ("Config",),

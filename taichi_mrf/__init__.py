@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from taichi_mrf.evaluation.accuracy import accuracy as accuracy
     from taichi_mrf.export.formats import export_map as export_map
     from taichi_mrf.export.options import ExportOptions as ExportOptions
+    from taichi_mrf.mapping.merging import merge as merge
+    from taichi_mrf.mapping.onto import locate as locate
     from taichi_mrf.methods.chunked import ChunkedMap as ChunkedMap
     from taichi_mrf.methods.chunked_part import take_part as take_part
     from taichi_mrf.methods.log_odds.map import LogOddsMap as LogOddsMap
@@ -65,6 +67,8 @@ _PUBLIC = {
     "load_map": "taichi_mrf.methods.registry",
     "ChunkedMap": "taichi_mrf.methods.chunked",
     "take_part": "taichi_mrf.methods.chunked_part",
+    "locate": "taichi_mrf.mapping.onto",
+    "merge": "taichi_mrf.mapping.merging",
     "accuracy": "taichi_mrf.evaluation.accuracy",
     "UNKNOWN": "taichi_mrf.queries.points",
     "FREE": "taichi_mrf.queries.points",

@@ -2,8 +2,8 @@
 
 The kitchen's depth images and the building's scans become bags, without the frames that judge. A server of
 Foxglove's own library plays them to `taichi-mrf live` as a person runs it, at their own pace and at three
-times that. What it saves is compared, array by array, with what `map` makes of the frames that it took. In
-the last part the kitchen is played again and again at 10 Hz, stamped with the present clock.
+times that. What it saves is compared, array by array, with what `map` makes of the frames that it took. The
+kitchen is also played again and again at 10 Hz, stamped with the present clock.
 """
 
 import os
@@ -12,8 +12,9 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
@@ -38,59 +39,66 @@ HOLD_OUT = 10
 QUIET_S = 10.0
 """A run that has taken no frame for so long takes no more of those that were sent."""
 
-LAG_HZ, LAG_S, KEPT, SAMPLE_S = 10.0, 300.0, 48, 30.0
-"""The last part: images a second, seconds, keyframes that can still be changed, seconds between samples."""
+KEPT, SAMPLE_S = 48, 60.0
+"""Again and again: keyframes that can still be changed, and seconds between samples of memory."""
 
 NOT_OF_THE_MAP = {"config", "manifest", "keyframe_names"}
 """Arrays in a map's file: the flags, checksums, and the numbers of frames, which count those left out."""
 
 COLUMNS = (
-    "images a second", "sent", "mapped", "equal to map BAG", "right", "of map BAG", "lag (ms)", "95%", "most",
-    "processor (ms)", "MB at first", "MB at last",
+    "images a second", "sent", "mapped", "equal to `map BAG`", "right", "lag (ms): median, 95%, most",
+    "processors (ms)", "MB after a minute, at the end",
 )  # fmt: skip
 
-TF = ("/tf", "/tf_static")
+Message = tuple[int, str, int, bytes]
+"""What is sent: the number of its image, topic, time in nanoseconds, and bytes."""
+
+TF, IMAGES = ("/tf", "/tf_static"), ("/camera/depth", "/points")
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to play a bag: its ``pace`` over its own; without every ``drop``-th image; for ``lasts_s``
+    seconds again and again at ``rate_hz``, stamped with the present clock, if that is not 0."""
+
+    pace: float = 1.0
+    drop: int = 0
+    lasts_s: float = 0.0
+    rate_hz: float = 10.0
+
+
+WAYS = {
+    "": Way(),
+    ", three times as fast": Way(pace=3.0),
+    ", every third image dropped": Way(drop=3),
+    ", again and again": Way(lasts_s=300.0),
+}
 
 
 def run_wire(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """One row for each recording and way to play it."""
+    """One row for each recording and way to play it: docs/results/wire.csv."""
     rows: list[list[Entry]] = []
-    for scene_of, voxel_size in ((kitchen_scene, 0.05), (lidar_scene, 0.2)):
-        part = "kitchen" if scene_of is kitchen_scene else "building"
-        ways = [Way(1.0), Way(3.0), Way(1.0, drop=3)]
-        ways += [Way(LAG_HZ / 3, lasts_s=LAG_S)] if part == "kitchen" else []
-        for number, way in enumerate(ways):
-            name = f"{part}, {way.in_words}"
-            if not experiment.wants(name):
-                continue
-            experiment.report(name, number, len(ways))
+    parts = {
+        f"{part}{name}": (scene_of, voxel_size, way)
+        for part, scene_of, voxel_size in (("kitchen", kitchen_scene, 0.05), ("building", lidar_scene, 0.2))
+        for name, way in WAYS.items()
+        if part == "kitchen" or not way.lasts_s
+    }
+    for number, (name, (scene_of, voxel_size, way)) in enumerate(parts.items()):
+        if experiment.wants(name):
+            experiment.report(name, number, len(parts))
             run = _Run(scene_of(experiment.data, experiment.limit), voxel_size, way)
             result = experiment.ledger.result(f"{name} | {experiment.limit}", run.result)
             rows.append([name, *(result[column] for column in COLUMNS)])
     notes = [
         f"Right: share of the held-out pixels (one frame in {HOLD_OUT}) whose likeliest surface lies within "
         "1.5 voxels of the measured depth.",
-        "Lag: from an image's arrival until the map with it is sent to the page: median, 95%, most. "
-        "Processor: time of both processes for each image that is mapped.",
-        f"MB: resident memory of both processes, {KEPT} keyframes kept; at first: after a minute.",
+        "Lag: from an image's arrival until the map with it is sent to the page. "
+        "Processors: time of both processes for each image that is mapped.",
+        f"MB: resident memory of both processes, {KEPT} keyframes kept.",
     ]
-    table = Table("wire", "A live run over Foxglove's protocol", ["run", *COLUMNS], rows, notes)
+    table = Table("wire", "A live run over Foxglove's protocol", ["played", *COLUMNS], rows, notes)
     return [table], write_table(experiment.out, table)
-
-
-@dataclass(frozen=True)
-class Way:
-    """A way to play a bag: its ``pace`` over its own; without every ``drop``-th image; for ``lasts_s``
-    seconds again and again, stamped with the present clock, if that is not 0."""
-
-    pace: float
-    drop: int = 0
-    lasts_s: float = 0.0
-
-    @property
-    def in_words(self) -> str:
-        dropped = f", every {self.drop}rd image dropped" if self.drop else ""
-        return f"{LAG_HZ:g} Hz" if self.lasts_s else f"pace x {self.pace:g}{dropped}"
 
 
 @dataclass
@@ -109,34 +117,31 @@ class _Run:
         views = list(enumerate(self.scene.views, start=1))
         self.views = [view for number, view in views if not is_held_out(number, HOLD_OUT)]
         self.judged = [view for number, view in views if is_held_out(number, HOLD_OUT)]
+        begin_s = float(self.views[0].stamp_s or 0.0)
+        self.stamps_s = [float(view.stamp_s or 0.0) - begin_s for view in self.views]
 
     def result(self) -> Result:
         """The row's figures by their columns."""
         from foxglove_robot import robot
 
+        way, equal, right, memory = self.way, "-", "-", "-"
         with TemporaryDirectory() as name:
             folder = Path(name)
             events, saved = folder / "events", folder / "live"
             with robot(self._bag(folder, "all", range(len(self.views)))) as sender:
                 self._live(sender, events, saved)
             taken, lags_s = _taken(events)
-            if self.way.lasts_s:
-                equal, right, of_bag = None, None, None
-            else:
+            if not way.lasts_s:
                 bag = self._bag(folder, "taken", [self.sent[number] for number in taken])
-                equal, right, of_bag = self._compared(saved / "map.npz", self._mapped(bag, folder / "bag"))
-        rate_hz = (
-            LAG_HZ
-            if self.way.lasts_s
-            else self.way.pace * (len(self.views) - 1) / self._seconds(len(self.views) - 1)
-        )
+                equal, right = self._compared(saved / "map.npz", self._mapped(bag, folder / "bag"))
+        rate_hz = way.rate_hz if way.lasts_s else way.pace * (len(self.views) - 1) / self.stamps_s[-1]
         lags_ms = 1e3 * np.array(lags_s[1:])  # the first waits for what is compiled
-        after_a_minute = self.usage[min(2, len(self.usage) - 1)][0]
-        memory = (after_a_minute, self.usage[-1][0]) if self.way.lasts_s else (None, None)
-        lags = (float(np.median(lags_ms)), float(np.quantile(lags_ms, 0.95)), float(lags_ms.max()))
+        lags = np.median(lags_ms), np.quantile(lags_ms, 0.95), lags_ms.max()
         used_ms = 1e3 * (self.usage[-1][1] - self.usage[0][1]) / max(1, len(taken) - 1)
-        print(*(f"{megabytes:.0f} MB, {used_s:.0f} s;" for megabytes, used_s in self.usage), file=sys.stderr)
-        row = (rate_hz, len(self.sent), len(taken), equal, right, of_bag, *lags, used_ms, *memory)
+        if way.lasts_s:
+            memory = f"{self.usage[1][0]:.0f}, {self.usage[-1][0]:.0f}"
+        said = ", ".join(f"{lag:.0f}" for lag in lags)
+        row = (f"{rate_hz:.1f}", len(self.sent), len(taken), equal, right, said, f"{used_ms:.0f}", memory)
         return dict(zip(COLUMNS, row, strict=True))
 
     def _bag(self, folder: Path, name: str, numbers: Any) -> Path:
@@ -149,7 +154,7 @@ class _Run:
             if isinstance(self.scene.camera, PinholeCamera):
                 bag.camera_info("/camera/camera_info", "sensor", self.scene.camera)
             for number in numbers:
-                view, at = self.views[number], 1.0 + self._seconds(number)
+                view, at = self.views[number], 1.0 + self.stamps_s[number]
                 bag.latency = 0.04
                 bag.tf("/tf", at, "map", "base", view.T_world_camera)
                 bag.latency = 0.05
@@ -162,76 +167,74 @@ class _Run:
 
         return Path(write_bag(folder, play, kind="mcap", name=name))
 
-    def _seconds(self, number: int) -> float:
-        return float(self.views[number].stamp_s or 0.0) - float(self.views[0].stamp_s or 0.0)
-
     def _live(self, sender: Any, events: Path, saved: Path) -> None:
         """Play the bag to a live run, until that has mapped it or takes no more."""
         from live_program import LiveProgram, wait_for
 
         events.touch()
-        flags = ["--keep-live", str(KEPT)] if self.way.lasts_s else ["--out", str(saved)]
-        start = ("-m", "benchmarks.lab.wire_events", str(events))
-        first = Thread(target=self._send_first, args=(sender,))
+        messages = self._messages(sender)
+        flags = ["--voxel-size", str(self.voxel_size), "--exit-when-done"]
+        if self.way.lasts_s:
+            flags += ["--keep-live", str(KEPT)]
+        else:
+            sent = sum(not self._is_dropped(number) for number in range(len(self.views)))
+            flags += ["--out", str(saved), "--limit", str(sent)]
+        first = Thread(target=self._send_first, args=(sender, messages))
         first.start()
-        flags += ["--voxel-size", str(self.voxel_size), "--exit-when-done"]
-        if not self.way.lasts_s:
-            flags += ["--limit", str(len(self._to_send()))]
+        start = ("-m", "benchmarks.lab.wire_events", str(events))
         with LiveProgram(sender.source, *flags, start=start) as program:
             first.join()
             wait_for(lambda: len(_of(events, "shown")) == 1, "the first keyframe")
-            self._play(sender, lambda: self.usage.append(_usage(program.group())))
+            self._play(sender, messages, lambda: self.usage.append(_usage(program.group())))
             if self.way.lasts_s or not _ends(program, events):
                 program.end(signal.SIGINT)
             assert program.wait() in (0, 130), program.said
 
-    def _to_send(self) -> list[int]:
+    def _is_dropped(self, number: int) -> bool:
         drop = self.way.drop
-        return [number for number in range(len(self.views)) if not drop or number % drop != drop - 1]
+        return bool(drop) and number % drop == drop - 1
 
-    def _send_first(self, sender: Any) -> None:
-        """What comes before the second image's pose, once somebody listens."""
-        sender.wait_for(*sender.channels)
-        time.sleep(0.5)  # the server notes who asks a moment after it says so
-        topics = [topic for topic, _, _ in sender.messages]
-        for message in sender.messages[: topics.index("/tf", topics.index("/tf") + 1)]:
-            self._send(sender, *message)
-        self.sent = [0]
-
-    def _play(self, sender: Any, sample: Callable[[], None]) -> None:
-        """Send the images after the first with their poses, each when it is due."""
-        drop, lasts_s = set(range(len(self.views))) - set(self._to_send()), self.way.lasts_s
-        start = next_sample = time.monotonic()
-        for lap in range(10**6):
-            number = -1
+    def _messages(self, sender: Any) -> Iterator[Message]:
+        """All that is sent, without the images that are dropped."""
+        for lap in count() if self.way.lasts_s else range(1):
+            number = lap * len(self.views) - 1
             for topic, logged_ns, data in sender.messages:
                 number += topic == "/tf"
-                image = topic not in ("/tf", "/tf_static", "/camera/camera_info")
-                if lap == 0 and number <= 0:
-                    continue
-                place_s = (lap * len(self.views) + number) / LAG_HZ
-                due_s = place_s if lasts_s else self._seconds(number) / self.way.pace
-                time.sleep(max(0.0, start + due_s - time.monotonic()))
-                if time.monotonic() >= next_sample:
-                    sample()
-                    next_sample += SAMPLE_S
-                if not (image and number in drop):
-                    self._send(sender, topic, logged_ns, data)
-                    self.sent += [number] if image else []
-                if lasts_s and time.monotonic() > start + lasts_s:
-                    break
-            if not lasts_s or time.monotonic() > start + lasts_s:
+                if topic not in IMAGES or not self._is_dropped(number):
+                    yield number, topic, logged_ns, data
+
+    def _send_first(self, sender: Any, messages: Iterator[Message]) -> None:
+        """What comes up to the first image, once somebody listens."""
+        sender.wait_for(*sender.channels)
+        time.sleep(0.5)  # the server notes who asks a moment after it says so
+        while not self.sent:
+            self._send(sender, next(messages))
+
+    def _play(self, sender: Any, messages: Iterator[Message], sample: Callable[[], None]) -> None:
+        """Send the images after the first with their poses, each when it is due."""
+        start, way, next_sample = time.monotonic(), self.way, 0.0
+        for message in messages:
+            number = message[0]
+            due_s = number / way.rate_hz if way.lasts_s else self.stamps_s[number] / way.pace
+            if way.lasts_s and due_s > way.lasts_s:
                 break
+            time.sleep(max(0.0, start + due_s - time.monotonic()))
+            if due_s >= next_sample:
+                sample()
+                next_sample += SAMPLE_S
+            self._send(sender, message)
         sample()
 
-    def _send(self, sender: Any, topic: str, logged_ns: int, data: bytes) -> None:
-        """Send a message; in the last part as of now, an image as of its pose."""
+    def _send(self, sender: Any, message: Message) -> None:
+        """Send a message; again and again as of now, an image as of its pose."""
+        number, topic, logged_ns, data = message
         if self.way.lasts_s:
             self.now_ns = time.time_ns() if topic in TF else self.now_ns
             logged_ns, changed = self.now_ns, bytearray(data)
             struct.pack_into("<iI", changed, 8 if topic in TF else 4, *divmod(logged_ns, 10**9))
             data = bytes(changed)
         sender.channels[topic].log(data, log_time=logged_ns)
+        self.sent += [number] if topic in IMAGES else []
 
     def _mapped(self, bag: Path, out: Path) -> Path:
         """The map that `map` makes of a bag, with the parameters of a live run."""
@@ -241,17 +244,16 @@ class _Run:
         subprocess.run([*command, *flags], check=True)
         return out / "map.npz"
 
-    def _compared(self, live: Path, of_bag: Path) -> tuple[str, float, float]:
-        """Whether both maps hold the same arrays, and how well each predicts the held-out frames. The map of
-        a run that was stopped is inferred first, as `map` does."""
-        maps = [tm.load_map(live), tm.load_map(of_bag)]
-        if not maps[0].settled:
-            maps[0].infer()
-            maps[0].save(live)
-        with np.load(live) as ours, np.load(of_bag) as theirs:
-            names = {*ours, *theirs} - NOT_OF_THE_MAP
-            apart = [name for name in sorted(names) if not _same(ours, theirs, name)]
-        return ", ".join(apart) or "yes", self._right(maps[0]), self._right(maps[1])
+    def _compared(self, live: Path, of_bag: Path) -> tuple[str, str]:
+        """Which arrays of both maps differ, and how well the live map predicts the held-out frames. The map
+        of a run that was stopped is inferred first, as `map` does."""
+        m = tm.load_map(live)
+        if not m.settled:
+            m.infer()
+            m.save(live)
+        ours, theirs = _bits(live), _bits(of_bag)
+        apart = [name for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]
+        return ", ".join(apart) or "yes", f"{self._right(m):.3f}".removeprefix("0")
 
     def _right(self, m: Any) -> float:
         scores = [
@@ -264,12 +266,11 @@ class _Run:
         return float(np.mean(scores))
 
 
-def _same(ours: Any, theirs: Any, name: str) -> bool:
-    """True if two maps' files have an array, bit for bit."""
-    if name not in ours or name not in theirs:
-        return False
-    one, other = ours[name], theirs[name]
-    return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+def _bits(path: Path) -> dict[str, object]:
+    """The arrays of a map's file, bit for bit."""
+    with np.load(path) as arrays:
+        names = set(arrays) - NOT_OF_THE_MAP
+        return {name: (arrays[name].dtype, arrays[name].shape, arrays[name].tobytes()) for name in names}
 
 
 def _of(events: Path, kind: str) -> list[list[float]]:

@@ -24,11 +24,13 @@ from taichi_mrf.geometry.poses import Pose, tangent_norms
 @dataclass(frozen=True)
 class FoundPose:
     """End of an alignment, the share of the map that the scan looks ``through`` from there, and what the
-    place is ``worth``, at most 1."""
+    place is ``worth``, at most 1. ``in_free`` is the share of the scan that lies where the map is free, if
+    that was asked."""
 
     end: Aligned
     through: float
     worth: float
+    in_free: float = 0.0
 
 
 def found_around(

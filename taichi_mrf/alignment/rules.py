@@ -210,8 +210,18 @@ class Rules:
     whole_through: float = 0.05
     """Share of the map that the images of a camera may look through where they are found in a whole map."""
 
-    whole_scan_through: float = 0.02
+    whole_scan_through: float = 0.03
     """That share for the scans of a sensor that sees around, whose sightlines are coarser."""
+
+    whole_in_free: float = 0.08
+    """Share of the images' points that may lie where the map is free, there: things that were moved, and a
+    stereo camera's errors."""
+
+    whole_scan_in_free: float = 0.03
+    """That share for scans."""
+
+    whole_free_m: float = 0.2
+    """Metres around a point, at least two voxels, that have to be free as well."""
 
     whole_agreement: float = 0.75
     """Share of the points with a surface near them that have to lie on it, there."""
@@ -315,6 +325,12 @@ class Rules:
 
     loop_loss: float = 0.1
     """Log-likelihood of the depth around a loop's ends that closing it may cost."""
+
+    merged_m: float = 0.01
+    """Standard deviation, in metres along each axis, of a keyframe's place in a map that is merged."""
+
+    merged_rad: float = 0.005
+    """Standard deviation of its turn about each axis."""
 
     least_motion: float = 0.02
     """Voxels by which what a keyframe sees has to move at least, or it stays."""

@@ -2,11 +2,12 @@
 
 A stretch of ten frames, by their own poses one scan, is tried at every place near the cameras of the map and
 under every heading (wide_search). What fits best is aligned from coarse to fine, fewer poses at each level.
-A place counts only if the surface of the stretch lies on that of the map, its images do not look through what
-the map has there, its points determine all six directions, and no other place fits nearly as well.
+A place counts only if the surface of the stretch lies on that of the map, its images do not look through
+what the map has there, hardly any of it lies where the map is free, its points determine all six directions,
+and no other place fits nearly as well.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -47,7 +48,8 @@ class LocatedRecording:
 
     ``covariance`` (6, 6) is that of the twist (rho, omega) of the middle camera of the ``frames``, in its
     frame. ``overlap`` is the share of what the frames see that lies near the map, ``agreement`` the share of
-    that which lies on it, and ``through`` the share of the map that they would look through.
+    that which lies on it, ``through`` the share of the map that they would look through, and ``in_free`` the
+    share of what they see that would lie where the map is free.
     """
 
     T_map_recording: Pose | None
@@ -56,6 +58,7 @@ class LocatedRecording:
     overlap: float = 0.0
     agreement: float = 0.0
     through: float = 0.0
+    in_free: float = 0.0
     places: tuple[Pose, ...] = ()
     frames: tuple[str, ...] = ()
 
@@ -85,6 +88,7 @@ class LocatedRecording:
             "overlap": self.overlap,
             "agreement": self.agreement,
             "looked_through": self.through,
+            "in_free_space": self.in_free,
             "frames": list(self.frames),
             "reason": self.reason,
         }
@@ -94,12 +98,14 @@ class LocatedRecording:
 class WholeMap:
     """What a map shows of its world: its ``surface``, the ``walls`` that several of its keyframes have
     measured, which nothing can look through, the places ``cameras_m`` (N, 3) of its keyframes, and ``up``
-    (3,), upwards in its world to 45 degrees."""
+    (3,), upwards in its world to 45 degrees. ``is_free`` tells of points (N, 3), in metres, which lie in free
+    space, (N,)."""
 
     surface: Surfels
     walls: Planes
     cameras_m: NDArray[np.float64]
     up: NDArray[np.float64]
+    is_free: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
     @cached_property
     def planes(self) -> Planes:
@@ -115,6 +121,14 @@ class WholeMap:
     def fine(self) -> list[SurfelGrid]:
         """Levels on which the best of them are."""
         return grids_of(self.surface, RULES.around_finest_m, RULES.whole_finest_m)[1:]
+
+    def in_free(self, points_m: NDArray[np.float64]) -> float:
+        """The share of points (N, 3) around which all is free."""
+        reach_m = max(RULES.whole_free_m, 2 * self.surface.cell_size)
+        free = self.is_free(points_m)
+        for step in reach_m * np.concatenate([np.eye(3), -np.eye(3)]):
+            free[free] = self.is_free(points_m[free] + step)
+        return float(free.mean())
 
 
 def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
@@ -147,6 +161,10 @@ class Stretch:
         )
         self.around = sees_around(images[0].camera)
         self._sights = [Sightlines.of(image) for image in images] if self.around else []
+
+    def points_from(self, T_map_scan: Pose) -> NDArray[np.float64]:
+        """The points (N, 3), in metres in the map, from a pose (4, 4)."""
+        return self.points.points.astype(np.float64) @ T_map_scan[:3, :3].T + T_map_scan[:3, 3]
 
     def looks_through(self, surface: Planes, T_map_scan: Pose) -> float:
         """The share of a mapped surface that the images look through from a pose (4, 4), in the mean."""
@@ -185,11 +203,12 @@ def locate_stretch(stretch: Stretch, whole: WholeMap) -> LocatedRecording:
 
     def aligned(grid: SurfelGrid, every: int, poses: Sequence[Pose]) -> list[FoundPose]:
         problem = PointToPlane(points.chosen(slice(None, None, every)), grid)
-        ends = [align(problem, T, Recorded(T, FREE), lever_m, RULES.observable) for T in poses]
-        through = [stretch.looks_through(whole.walls, end.T_world_camera) for end in ends]
-        found = [
-            FoundPose(end, share, end.equations.fit - share) for end, share in zip(ends, through, strict=True)
-        ]
+        found = []
+        for T in poses:
+            end = align(problem, T, Recorded(T, FREE), lever_m, RULES.observable)
+            through = stretch.looks_through(whole.walls, end.T_world_camera)
+            in_free = whole.in_free(stretch.points_from(end.T_world_camera))
+            found.append(FoundPose(end, through, end.equations.fit - through - in_free, in_free))
         return distinct(found, RULES.one_pose_m)
 
     places: list[FoundPose] = []
@@ -231,7 +250,11 @@ def _judged(stretch: Stretch, places: Sequence[FoundPose], lever_m: float) -> Lo
     best, *others = places
     equations, T_scan_recording = best.end.equations, inverse(stretch.T_recording_scan)
     seen = LocatedRecording(
-        None, overlap=equations.overlap, agreement=agreement(equations), through=best.through
+        None,
+        overlap=equations.overlap,
+        agreement=agreement(equations),
+        through=best.through,
+        in_free=best.in_free,
     )
     reason = _objection(seen, best, stretch.around)
     if reason:
@@ -265,6 +288,10 @@ def _objection(seen: LocatedRecording, best: FoundPose, around: bool) -> str:
     if seen.through > most:
         share = 100 * seen.through
         return f"another place: where it fits best, it would look through {share:.0f}% of what is mapped"
+    most = RULES.whole_scan_in_free if around else RULES.whole_in_free
+    if seen.in_free > most:
+        share = 100 * seen.in_free
+        return f"another place: where it fits best, {share:.0f}% of what is seen lies where the map is free"
     if best.end.directions < 6:
         return f"too little seen: it determines {best.end.directions} of the six directions of its place"
     return ""

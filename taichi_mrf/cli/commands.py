@@ -17,7 +17,7 @@ from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.options.live import Demo, Live
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.measure import Bench, Eval
-from taichi_mrf.cli.options.saved_maps import Diff, Export, Import, Info
+from taichi_mrf.cli.options.saved_maps import Diff, Export, Import, Info, Merge
 from taichi_mrf.cli.options.tune import Tune
 
 
@@ -104,6 +104,7 @@ COMMANDS = {
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),
     "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),
+    "merge": Command(Merge, "taichi_mrf.cli.merge:run_merge"),
     "info": Command(Info, "taichi_mrf.cli.info:run_info"),
     "doctor": Command(Doctor, "taichi_mrf.cli.doctor:run_doctor"),
     "bench": Command(Bench, "taichi_mrf.cli.bench:run_bench", None, _BENCH_FLAGS),

@@ -144,6 +144,8 @@ class Dataset(ABC):
     dropped: int = 0
     distortion: tuple[float, ...] = ()
     tracked: bool = False
+    confidence: Confidence | None = field(default=None, kw_only=True)
+    """Meaning of the images of confidence that come with the frames, None without."""
 
     @property
     def endless(self) -> bool:
@@ -162,8 +164,11 @@ class Dataset(ABC):
 
     @property
     def stated(self) -> StatedSensor:
-        """Properties of the sensor that the recording states."""
-        return StatedSensor()
+        """Properties of the sensor that the recording states: here a sigma that the confidence is relative
+        to."""
+        if self.confidence is None:
+            return StatedSensor()
+        return StatedSensor(self.confidence.sigma, True, self.confidence.origin)
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -251,22 +256,12 @@ class Table(Dataset, Generic[AnyRow]):
     """A recording as a table with a row for each frame. A format fills it, and says how a row is loaded."""
 
     rows: Sequence[AnyRow] = field(kw_only=True)
-    confidence: Confidence | None = field(default=None, kw_only=True)
-    """Meaning of the images of confidence that come with the frames, None without."""
-
     track: Callable[[], StampedPoses] | None = field(default=None, kw_only=True)
     """Reads the poses with stamps of their own; None if there are only those of rows."""
 
     def own_poses(self) -> StampedPoses | None:
         """Those of ``track``."""
         return None if self.track is None else self.track()
-
-    @property
-    def stated(self) -> StatedSensor:
-        """Sigma that the confidence is relative to."""
-        if self.confidence is None:
-            return super().stated
-        return StatedSensor(self.confidence.sigma, True, self.confidence.origin)
 
     @abstractmethod
     def load(self, index: int, row: AnyRow, T_world_camera: Pose) -> Frame:

@@ -23,12 +23,13 @@ from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.geometry.up import up_vector
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
+from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.intake import Added, Intake
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.queries.points import FREE
 from taichi_mrf.sensor.frame import Frame
 
 EVERYWHERE = np.full(3, np.inf)
@@ -99,21 +100,8 @@ def whole_map(m: MRFMap) -> WholeMap:
     surface = m.aligner.surface.around(-EVERYWHERE, EVERYWHERE)
     walls = walls_of(surface, [m.aligner.surface.of([id]) for id in m.keyframes])
     cameras_m = np.stack([keyframe.T_world_camera[:3, 3] for keyframe in m.keyframes.values()])
-    return WholeMap(surface, walls, cameras_m, up_vector(m.up))
-
-
-def frame_of(keyframe: Keyframe) -> Frame:
-    """A keyframe of a map as the frame that it was."""
-    return Frame(
-        keyframe.depth_m,
-        keyframe.T_world_camera,
-        keyframe.camera,
-        keyframe.stamp_s,
-        keyframe.name,
-        color=keyframe.color,
-        sigma_m=keyframe.own.sigma_m,
-        noise=keyframe.own.noise,
-        no_return=keyframe.own.no_return,
+    return WholeMap(
+        surface, walls, cameras_m, up_vector(m.up), lambda points: m.marginals.state(points) == FREE
     )
 
 
@@ -203,16 +191,17 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
         tracked=dataset.tracked,
         source=dataset,
         located=located,
-        prefix=_prefix(m, dataset),
+        prefix=free_prefix(m, () if dataset.endless else dataset.frame_names),
         later_s=later_s,
         map_origin_m=np.asarray(m.config.volume.origin),
     )
 
 
-def _prefix(m: OccupancyMap, dataset: Dataset) -> str:
-    """Prefix under which no frame of a dataset has the name of a keyframe of a map; empty if none has."""
+def free_prefix(m: OccupancyMap, names: Sequence[str] = ()) -> str:
+    """Prefix under which none of the ``names`` is that of a keyframe of a map, empty if none is; without
+    names, one under which no keyframe of the map stands yet."""
     taken = {keyframe.name for keyframe in m.keyframes.values()}
-    if not dataset.endless and taken.isdisjoint(dataset.frame_names):
+    if names and taken.isdisjoint(names):
         return ""
     days = (f"{day}:" for day in itertools.count(2))
     return next(day for day in days if not any(name.startswith(day) for name in taken))

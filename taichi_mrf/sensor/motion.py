@@ -20,6 +20,9 @@ is held still: then up is right to about 2 degrees."""
 
 LEAST_SAMPLES = 10
 
+MOST_SAMPLES = 2000
+"""Samples beside a camera that runs, of a gyroscope as of an accelerometer, that are kept: at least 5 s."""
+
 
 @dataclass(frozen=True)
 class AccelerationSamples:
@@ -45,8 +48,11 @@ def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.asarray(mean / size)
 
 
-def upwards_at(samples: AccelerationSamples, first_s: float) -> NDArray[np.float64] | None:
-    """Upwards as :func:`upwards` has it, by the samples around the first image, at ``first_s``."""
+def upwards_at(samples: AccelerationSamples | None, first_s: float) -> NDArray[np.float64] | None:
+    """Upwards as :func:`upwards` has it, by the samples around the first image, at ``first_s``; None without
+    any."""
+    if samples is None:
+        return None
     return upwards(samples.accelerations_m_s2[np.abs(samples.stamps_s - first_s) <= AT_REST_S])
 
 

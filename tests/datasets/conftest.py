@@ -1,14 +1,56 @@
 """Parts that tests of readers share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from threading import Thread
+from typing import Any
 
 import pytest
-from inputs_bags import write_bag
+from inputs_bags import Bag, Kind, write_bag
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.wires import robot as wired
 
 
 @pytest.fixture
 def make(tmp_path: Path) -> Callable[..., Path]:
     """Writes a bag of parts; returns its path."""
     return partial(write_bag, tmp_path)
+
+
+@pytest.fixture
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Any]]:
+    """Opens a robot that sends its ``first`` messages while it is listened to. Returns the robot, the dataset
+    and the bag of all that it sends."""
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+    from foxglove_robot import robot
+
+    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
+    monkeypatch.setattr(wired, "DECIDE_S", 0.3)
+    with ExitStack() as stack:
+
+        def begin_one(
+            *parts: Callable[[Bag], object],
+            query: str = "",
+            first: int = 1000,
+            kind: Kind = "mcap",
+            color: bool = False,
+            listen_to: str = "/tf_static",
+        ) -> tuple[Any, Dataset, Path]:
+            bag = write_bag(tmp_path, *parts, kind=kind)
+            sender = stack.enter_context(robot(bag))
+
+            def send() -> None:
+                sender.wait_for(listen_to)
+                sender.send_next(first)
+
+            thread = Thread(target=send)
+            thread.start()
+            try:
+                return sender, open_dataset(sender.source + query, color=color), bag
+            finally:
+                thread.join()
+
+        yield begin_one

@@ -6,10 +6,30 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, Make, images, mounted, plain, stamp, steps
+from inputs_bags import (
+    CAMERA,
+    CONFIDENCE,
+    COUNT,
+    FRAME,
+    IMU,
+    LINK,
+    RATE,
+    UP,
+    Bag,
+    Kind,
+    Make,
+    T_camera_imu,
+    confidence,
+    grades,
+    images,
+    imu,
+    mounted,
+    plain,
+    stamp,
+    steps,
+)  # fmt: skip
 from refusals import bad_frame, refused
 
-from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import start_pose
@@ -98,23 +118,6 @@ def test_a_colour_topic_can_be_chosen_and_must_be_one(make: Make) -> None:
     refused(f"{path}?color=/camera/depth/image_raw&depth=/camera/depth/image_raw", "is not colour")
 
 
-CONFIDENCE = "/camera/confidence/image_rect_raw"
-
-
-def grades(i: int) -> np.ndarray:
-    image = np.random.default_rng(200 + i).integers(0, 16, CAMERA.shape).astype(np.uint8)
-    image[0, :3] = 0, 1, 15
-    return image
-
-
-def confidence(
-    bag: Bag, topic: str = CONFIDENCE, shift: int = 4, encoding: str = "mono8", skip: int | None = None
-) -> None:
-    for i in range(COUNT):
-        if i != skip:
-            bag.image(topic, stamp(i) + 0.01, FRAME, grades(i) << shift, encoding)
-
-
 def expected(i: int) -> np.ndarray:
     """sigma / max(share, 0.1), infinite for the grade 0."""
     depth_m = np.where(steps(i) > 0, steps(i) / 1000, 0.0)
@@ -197,38 +200,6 @@ def test_a_later_image_that_is_damaged_is_a_bad_frame(make: Make) -> None:
     assert dataset.read(0).sigma_m is not None
     bad_frame(dataset, 1, f"topic {CONFIDENCE}: has values up to 200, which are no")
     bad_frame(dataset, 2, "has 16 x 11 pixels", "expected 16 x 12")
-
-
-IMU, LINK = "/imu/data", "imu_link"
-T_camera_imu = moved(np.eye(4), [0.02, 0.0, 0.01, 1.2, -0.9, 0.4])
-RATE = np.array([0.3, -0.8, 0.5])
-"""Radians a second in the camera frame."""
-
-TILT = moved(np.eye(4), [0, 0, 0, 0.2, 0.0, 0.3])[:3, :3]
-UP = TILT.T @ [0.0, -1.0, 0.0]
-
-
-def imu(
-    bag: Bag,
-    topic: str = IMU,
-    tf: bool = True,
-    covariance: float = 0.0,
-    shake: float = 0.0,
-) -> None:
-    if tf:
-        bag.tf("/tf_static", 0.0, FRAME, LINK, T_camera_imu)
-    to_imu, random = T_camera_imu[:3, :3].T, np.random.default_rng(0)
-    unknown = np.zeros(9)
-    unknown[0] = covariance
-    for k in range(160):
-        at = 0.8 + k / 200
-        force = to_imu @ (GRAVITY * UP) + random.normal(0, shake + 1e-6, 3)
-        bag.send(
-            topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, LINK),
-            orientation=bag.quaternion([0.0, 0.0, 0.0, 1.0]), orientation_covariance=np.zeros(9),
-            angular_velocity=bag.vector(to_imu @ RATE), angular_velocity_covariance=unknown,
-            linear_acceleration=bag.vector(force), linear_acceleration_covariance=np.zeros(9),
-        )  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

@@ -1,12 +1,10 @@
 """Robots that run, mapped as the bag of what they send would be: frames, poses, choices, and what is said."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import bag_clouds
@@ -14,7 +12,7 @@ import inputs_bags
 import numpy as np
 import pytest
 from datasets_recordings import CAMERA
-from heard import SECONDS, came, follow_bag, whole
+from heard import SECONDS, came, follow_bag, one_by_one, whole
 from inputs_bags import (
     COUNT,
     EYE,
@@ -24,7 +22,6 @@ from inputs_bags import (
     T_LINK_CAMERA,
     TOPIC,
     Bag,
-    Kind,
     images,
     mounted,
     moving_tf,
@@ -37,55 +34,20 @@ from inputs_bags import (
     write_bag,
 )
 
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.timed_poses import TimedPoses
-from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires import stream
 from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.frame import Frame
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
-from foxglove_robot import Robot, robot
+from foxglove_robot import robot
 
 Part = Callable[[Bag], object]
 Begin = Callable[..., Any]
-
-
-@pytest.fixture
-def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
-    """Opens a robot that sends its ``first`` messages while it is listened to. Returns the robot, the dataset
-    and the bag of all that it sends."""
-    monkeypatch.setattr(wired, "LISTEN_S", 0.5)
-    monkeypatch.setattr(wired, "DECIDE_S", 0.3)
-    with ExitStack() as stack:
-
-        def begin_one(
-            *parts: Part,
-            query: str = "",
-            first: int = 1000,
-            kind: Kind = "mcap",
-            color: bool = False,
-            listen_to: str = "/tf_static",
-        ) -> tuple[Robot, Dataset, Path]:
-            bag = write_bag(tmp_path, *parts, kind=kind)
-            sender = stack.enter_context(robot(bag))
-
-            def send() -> None:
-                sender.wait_for(listen_to)
-                sender.send_next(first)
-
-            thread = Thread(target=send)
-            thread.start()
-            try:
-                return sender, open_dataset(sender.source + query, color=color), bag
-            finally:
-                thread.join()
-
-        yield begin_one
 
 
 def compressed(bag: Bag, kind: str = "16UC1") -> None:
@@ -126,6 +88,20 @@ def test_ros_1_is_read_too(begin: Begin) -> None:
     ours, theirs = live.read(0), open_dataset(bag, color=False).read(COUNT - 1)
     np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
     np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+@pytest.mark.parametrize("way", [odometry, moving_tf])
+def test_an_image_waits_for_no_more_than_the_pose_of_its_own_stamp(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch, way: Part
+) -> None:
+    whole_ns = inputs_bags.nanoseconds
+    newest_ns = whole_ns(stamp(COUNT - 1))
+    odd_ns = next(ns for ns in range(10**6) if (newest_ns + ns) / 1e9 < (newest_ns + ns) / 10**9)
+    monkeypatch.setattr(inputs_bags, "nanoseconds", lambda stamp: whole_ns(stamp) + odd_ns)
+    _, live, bag = begin(images, mounted, way)
+    assert len(open_dataset(bag)) == COUNT
+    assert wait_until(lambda: came(live) == COUNT, SECONDS)
+    assert live.read(0).name == f"{COUNT - 1:06d}"
 
 
 def test_the_newest_image_is_taken_and_the_others_are_counted(begin: Begin) -> None:
@@ -276,81 +252,6 @@ def test_clouds_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> Non
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
 
 
-COLOR, OWN_FRAME = "/camera/color/image_raw", "camera_color_optical_frame"
-OWN = PinholeCamera(32, 20, 30.0, 31.0, 15.0, 9.5)
-T_depth_color = look_at([0.02, 0.0, 0.0], [0.02, 0.01, 1.0])
-
-
-def picture(i: int, camera: PinholeCamera = CAMERA) -> np.ndarray:
-    return np.random.default_rng(100 + i).integers(1, 256, (*camera.shape, 3)).astype(np.uint8)
-
-
-def of_another_camera(bag: Bag) -> None:
-    bag.camera_info("/camera/color/camera_info", OWN_FRAME, OWN)
-    mounted(bag, FRAME, OWN_FRAME, T_depth_color)
-    images(bag, COLOR, False, OWN_FRAME, lambda i: picture(i, OWN), "rgb8", late=0.01)
-
-
-def compressed_colors(bag: Bag) -> None:
-    for i in range(COUNT):
-        bag.compressed(COLOR, stamp(i) - 0.01, FRAME, picture(i), "png")
-    bag.compressed(COLOR, stamp(COUNT), FRAME, picture(7), "png")
-
-
-COLORS: dict[str, Part] = {
-    "registered": partial(images, topic=COLOR, info=False, image=picture, encoding="rgb8", late=0.01),
-    "of another camera": of_another_camera,
-    "compressed, and earlier than depth": compressed_colors,
-}
-
-
-def one_by_one(sender: Robot, live: Dataset) -> list[Frame]:
-    """The frames of what the robot sends, when each message is heard before the next is sent."""
-    found, heard = [], heard_by(whole(live))
-    while sender.sent < len(sender.messages):
-        heard += sender.messages[sender.sent][0] in sender.listener.topics
-        sender.send_next(1)
-        assert wait_until(partial(has_heard, live, heard), SECONDS)
-        if not live.awaiting():
-            found.append(live.read(0))
-    return found
-
-
-@pytest.mark.parametrize("kind", COLORS)
-def test_colours_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> None:
-    parts = (images, mounted, partial(odometry, numbers=[*BETWEEN, COUNT]), COLORS[kind])
-    sender, live, bag = begin(*parts, first=5 + 2 * (kind == "of another camera"), color=True)
-    recorded = open_dataset(bag)
-    assert {note for note in live.notes if note.startswith("color")} == {
-        note for note in recorded.notes if note.startswith("color")
-    }
-    found = one_by_one(sender, live)
-    assert len(found) == len(recorded) == COUNT
-    for ours, theirs in zip(found, recorded, strict=True):
-        assert theirs.color is not None
-        np.testing.assert_array_equal(ours.color, theirs.color)
-        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
-
-
-def test_depth_without_a_colour_image_near_it_has_no_colour(
-    begin: Begin, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = partial(images, topic=COLOR, info=False, image=picture, encoding="rgb8", numbers=[0])
-    sender, live, _ = begin(plain, one, color=True)
-    assert wait_until(lambda: came(live) == COUNT, SECONDS)
-    np.testing.assert_array_equal(live.read(0).color, picture(0))
-    assert live.awaiting()  # a colour image of the newest may yet come
-    monkeypatch.setattr(stream, "LATE_S", 0.1)
-
-    def is_there() -> bool:
-        sender.send("/tf_static")
-        return not live.awaiting()
-
-    assert wait_until(is_there, SECONDS)
-    frame = live.read(0)
-    assert (frame.name, frame.color) == (f"{COUNT - 1:06d}", None)
-
-
 def test_each_image_has_the_camera_of_its_time(begin: Begin) -> None:
     other, small = PinholeCamera(16, 12, 21.0, 22.0, 7.5, 5.5), PinholeCamera(8, 6, 7.0, 7.5, 3.5, 2.5)
     cameras = [CAMERA, CAMERA, other, small, small]
@@ -400,16 +301,6 @@ def test_poses_of_a_camera_link_are_turned_if_images_agree_so(begin: Begin, is_b
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
     np.testing.assert_allclose(live.read(0).T_world_camera, EYES[-1], atol=1e-6)
     assert any("of a body, x ahead and z up" in note for note in live.notes) == is_body
-
-
-def has_heard(live: Dataset, count: int) -> bool:
-    return heard_by(whole(live)) == count
-
-
-def heard_by(live: stream.Robot) -> int:
-    """Messages that have been heard so far."""
-    live.awaiting()
-    return sum(topic.messages for topic in live.heard.topics.values())
 
 
 def test_points_are_chosen_beside_images(begin: Begin) -> None:

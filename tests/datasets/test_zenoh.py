@@ -12,7 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 from heard import SECONDS, came, follow_bag, heard
-from inputs_bags import COUNT, INFO, TOPIC, images, mounted, moving_tf, odometry, plain, steps, write_bag
+from inputs_bags import (
+    COUNT,
+    IMU,
+    INFO,
+    TOPIC,
+    confidence,
+    images,
+    imu,
+    mounted,
+    moving_tf,
+    odometry,
+    plain,
+    steps,
+    write_bag,
+)  # fmt: skip
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import Dataset, open_dataset
@@ -186,6 +200,20 @@ def test_frames_are_those_of_the_bag_bit_for_bit(tmp_path: Path, kind: str, way:
     with robot(bag) as sender:
         live = begun(sender, 4, listen_to="/odom" if way == "odometry" else "/tf")
         follow_bag(sender, live, bag, COUNT)
+
+
+def test_confidence_and_turns_are_those_of_the_bag(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, images, imu, confidence, kind="mcap")
+    with robot(bag) as sender:
+        live = begun(sender, 60, query="?poses=track", listen_to=IMU)
+        assert live.read(0).sigma_m is not None
+        sender.send_next(1000)
+        assert wait_until(lambda: came(live) == COUNT and not live.awaiting(), SECONDS)
+        ours, theirs = live.read(1), open_dataset(f"{bag}?poses=track", color=False).read(COUNT - 1)
+    assert (ours.name, ours.stamp) == (theirs.name, theirs.stamp)
+    np.testing.assert_array_equal(ours.sigma_m, theirs.sigma_m)
+    span = ours.stamp - 0.1, ours.stamp
+    np.testing.assert_array_equal(ours.gyro.turn(*span), theirs.gyro.turn(*span))
 
 
 def test_a_robot_that_has_fixed_transforms_before_is_listened_to_is_mapped(tmp_path: Path) -> None:

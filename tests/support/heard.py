@@ -1,5 +1,6 @@
 """What a client of a robot's wire hears, and what a recording made of it shows: frames that are the bag's."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.wires import stream
 from taichi_mrf.datasets.wires.client import Client, Raw, wait_until
+from taichi_mrf.sensor.frame import Frame
 
 SECONDS = 20
 
@@ -53,3 +55,25 @@ def follow_bag(sender: Any, live: Dataset, bag: Path, count: int) -> None:
         assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
         np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def has_heard(live: Dataset, count: int) -> bool:
+    return heard_by(whole(live)) == count
+
+
+def heard_by(live: stream.Robot) -> int:
+    """Messages that have been heard so far."""
+    live.awaiting()
+    return sum(topic.messages for topic in live.heard.topics.values())
+
+
+def one_by_one(sender: Any, live: Dataset) -> list[Frame]:
+    """The frames of what the robot sends, when each message is heard before the next is sent."""
+    found, heard = [], heard_by(whole(live))
+    while sender.sent < len(sender.messages):
+        heard += sender.messages[sender.sent][0] in sender.listener.topics
+        sender.send_next(1)
+        assert wait_until(partial(has_heard, live, heard), SECONDS)
+        if not live.awaiting():
+            found.append(live.read(0))
+    return found

@@ -15,9 +15,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.motion import GRAVITY
 
 Kind = Literal["ros1", "sqlite", "mcap"]
 Make = Callable[..., Path]
@@ -368,6 +370,61 @@ def plain(bag: Bag) -> None:
     images(bag)
     odometry(bag)
     mounted(bag)
+
+
+CONFIDENCE = "/camera/confidence/image_rect_raw"
+
+
+def grades(i: int) -> np.ndarray:
+    image = np.random.default_rng(200 + i).integers(0, 16, CAMERA.shape).astype(np.uint8)
+    image[0, :3] = 0, 1, 15
+    return image
+
+
+def confidence(
+    bag: Bag, topic: str = CONFIDENCE, shift: int = 4, encoding: str = "mono8", skip: int | None = None
+) -> None:
+    """Images of grades of 4 bits."""
+    for i in range(COUNT):
+        if i != skip:
+            bag.image(topic, stamp(i) + 0.01, FRAME, grades(i) << shift, encoding)
+
+
+IMU, LINK = "/imu/data", "imu_link"
+T_camera_imu = moved(np.eye(4), [0.02, 0.0, 0.01, 1.2, -0.9, 0.4])
+RATE = np.array([0.3, -0.8, 0.5])
+"""Radians a second in the camera frame."""
+
+TILT = moved(np.eye(4), [0, 0, 0, 0.2, 0.0, 0.3])[:3, :3]
+UP = TILT.T @ [0.0, -1.0, 0.0]
+
+
+def imu(
+    bag: Bag,
+    topic: str = IMU,
+    tf: bool = True,
+    covariance: float = 0.0,
+    shake: float = 0.0,
+    seconds: float = 0.8,
+    latency: float = 0.05,
+) -> None:
+    """An IMU beside a camera that turns at RATE and does not move, from 0.8 s on at 200 Hz."""
+    bag.latency = latency
+    if tf:
+        bag.tf("/tf_static", 0.0, FRAME, LINK, T_camera_imu)
+    to_imu, random = T_camera_imu[:3, :3].T, np.random.default_rng(0)
+    unknown = np.zeros(9)
+    unknown[0] = covariance
+    for k in range(round(200 * seconds)):
+        at = 0.8 + k / 200
+        force = to_imu @ (GRAVITY * UP) + random.normal(0, shake + 1e-6, 3)
+        bag.send(
+            topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, LINK),
+            orientation=bag.quaternion([0.0, 0.0, 0.0, 1.0]), orientation_covariance=np.zeros(9),
+            angular_velocity=bag.vector(to_imu @ RATE), angular_velocity_covariance=unknown,
+            linear_acceleration=bag.vector(force), linear_acceleration_covariance=np.zeros(9),
+        )  # fmt: skip
+    bag.latency = Bag.latency
 
 
 def check_poses(

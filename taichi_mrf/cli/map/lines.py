@@ -110,7 +110,7 @@ def _keyframes_text(report: dict[str, Any]) -> str:
     frozen, before = report["frozen"], report["keyframes_before"]
     count = report["keyframes"] + frozen - before
     if before:
-        return f"{count} of them keyframes, which join {before} of {report['onto']}"
+        return f"{count} of them keyframes, which join {before} of the earlier map"
     return f"{count} of them keyframes" + (f", {frozen} frozen outside of the window" if frozen else "")
 
 

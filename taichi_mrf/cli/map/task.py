@@ -84,7 +84,7 @@ class MapTask:
         """Choices besides the parameters; the report says them too."""
         options = self.options
         noise = {} if options.noise == NoiseFlags() else {"noise_from": options.noise.origin}
-        onto = {} if options.onto is None else {"onto": str(options.onto), "frozen_before": options.frozen}
+        onto = {"onto": options.onto and str(options.onto), "frozen_before": options.frozen or None}
         return {"every": options.every, "limit": options.limit, **onto, **noise, **options.poses.choice()}
 
     def open(self, color: bool) -> Dataset:

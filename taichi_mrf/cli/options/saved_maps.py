@@ -1,4 +1,4 @@
-"""The options of the commands on files of maps: export, import, info and diff."""
+"""The options of the commands on files of maps: export, import, info, diff and merge."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -116,3 +116,29 @@ class Diff:
 
     arch: Arch = "auto"
     """Backend to read the maps on."""
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Merge saved maps of one place, each in a world of its own, into one map.
+
+    Each map is located in the others, and keyframes that see the same are aligned with each other; the first
+    map stays where it is, and its parameters hold. A map that is found in no other is refused.
+    Example: taichi-mrf merge monday/map.npz tuesday/map.npz --out both.npz
+    """
+
+    maps: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="MAP MAP...", help_behavior_hint="(required)"),
+    ]
+    """The saved maps, with their keyframes: the map.npz of runs."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="MAP")]
+    """The map to write, an .npz file."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print where the maps were located as JSON."""
+
+    arch: Arch = "auto"
+    """Backend to merge the maps on."""

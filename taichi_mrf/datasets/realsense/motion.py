@@ -15,13 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.motion import AT_REST_S, AccelerationSamples, GyroSamples, upwards_at
+from taichi_mrf.sensor.motion import (
+    AT_REST_S,
+    MOST_SAMPLES,
+    AccelerationSamples,
+    GyroSamples,
+    upwards_at,
+)
 
 LEAST_HZ = 100
 """Of the rates that the camera offers the lowest from here on is taken."""
-
-KEPT = 2000
-"""Samples of a camera's gyroscope, and of its accelerometer, that are kept: at least 5 s."""
 
 WAIT_S = 1.0
 """The longest wait for accelerations around a camera's first image, and for a recording's next samples."""
@@ -33,7 +36,7 @@ class MotionModule:
     """The motion sensor of a device of the library ``rs``, started. ``depth`` is the profile of the depth
     stream, of which it finds the frame. It keeps the last ``kept`` samples, all if None."""
 
-    def __init__(self, rs: Any, device: Any, depth: Any, kept: int | None = KEPT) -> None:
+    def __init__(self, rs: Any, device: Any, depth: Any, kept: int | None = MOST_SAMPLES) -> None:
         """Raises LookupError if the device has no gyroscope, RuntimeError as the library does."""
         self._rs = rs
         self._came = threading.Condition()
@@ -74,8 +77,7 @@ class MotionModule:
             return None
         with self._came:
             self._came.wait_for(lambda: samples and samples[-1][0] >= first_s + AT_REST_S, wait_s)
-        found = self.acceleration(clock)
-        return None if found is None else upwards_at(found, first_s)
+        return upwards_at(self.acceleration(clock), first_s)
 
     def wait(self, ended: threading.Event) -> None:
         """Wait until it has ended, or no further sample comes."""

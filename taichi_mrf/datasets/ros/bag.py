@@ -1,6 +1,6 @@
 """ROS 1 bags, ROS 2 bags and MCAP files: ``walk.bag?depth=/camera/depth/image_raw&pose=/odom&frame=map``.
 
-The fields of :class:`BagOptions` are the options; without any, the only depth topic and the only source of
+The fields of :class:`.SensorChoice` are the options; without any, the only depth topic and the only source of
 poses are used; the point clouds of a lidar, where there are no depth images or ``points`` names them
 (lidar.py). On opening, the stamp of each message is read; images are decoded when their frame is read. A pose
 is interpolated between its neighbours in time, and an image that has none near enough is left out and
@@ -27,7 +27,7 @@ from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.images import note_of_largest
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.beside import BagImu, Beside, find_colors, find_confidence, find_imu
+from taichi_mrf.datasets.ros.beside import Beside, find_colors, find_confidence, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
@@ -50,7 +50,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
+from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples, upwards_at
 from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"
@@ -62,18 +62,6 @@ _AGREE = 0.03
 
 _LOOKED_AT = 4
 """Images whose numbers are looked at when a bag is opened."""
-
-
-@dataclass(frozen=True)
-class BagOptions(SensorChoice):
-    """The options after the name of a bag."""
-
-    confidence: str = ""
-    """The topic of images of confidence, by default the one beside that of depth."""
-
-    imu: str = ""
-    """The topic of an IMU whose angular rates help to track the camera (``poses=track``), by default the only
-    one; ``none`` for tracking without."""
 
 
 @dataclass
@@ -178,7 +166,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
     read, missing or ambiguous topics, an unknown camera, and if no image has a
     pose.
     """
-    chosen = parse_options(BagOptions, query, str(path))
+    chosen = parse_options(SensorChoice, query, str(path))
     if options.track:
         chosen = replace(chosen, poses=TRACK)
     reader = RosReader(path)
@@ -200,7 +188,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
     return bag
 
 
-def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Dataset:
+def _open(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> Dataset:
     if maps_clouds(reader, chosen):
         return _open_lidar(reader, chosen, options)
     depth, sensor, cameras, found = find_depth_camera(reader, chosen, options)
@@ -213,11 +201,14 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         notes += said
     confidence, said = find_confidence(sensor, chosen.confidence, *parts)
     notes += said + cameras.notes
-    tracked, imu = chosen.poses == TRACK, BagImu()
+    tracked, gyro, acceleration = chosen.poses == TRACK, None, None
     if tracked:
-        imu = find_imu(sensor, chosen.imu, stamps[0])
-        posed = [(i, entry, start_pose(imu.up)) for i, entry, _ in posed]
-        notes += imu.notes
+        imu, said = find_imu(sensor, chosen.imu, stamps[0])
+        notes += said
+        if imu is not None:
+            gyro, acceleration = imu.samples(imu.rows)
+            T_start = start_pose(upwards_at(acceleration, stamps[0]))
+            posed = [(i, entry, T_start) for i, entry, _ in posed]
     bag = RosBag(
         name=reader.path.stem,
         camera=cameras.first,
@@ -234,15 +225,15 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         colors=colors,
         confidence=None if confidence is None else L515,
         confidences=confidence,
-        gyro=imu.gyro,
-        acceleration=imu.acceleration,
+        gyro=gyro,
+        acceleration=acceleration,
     )
     if may_be_body_axes(found, chosen, options):
         bag.look_at_axes(depth.frame)
     return bag
 
 
-def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
+def _open_lidar(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> LidarBag:
     sensor, found, clouds = find_clouds(reader, chosen, options)
     tracked = chosen.poses == TRACK
     posed, notes = posed_by(sensor, found, options)

@@ -7,8 +7,8 @@ byte, 0, 16, ... to 240; 0 to 15 are read too. The gyroscope of an IMU tells how
 accelerometer which way is up at the beginning.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from taichi_mrf.datasets.ros.sensor import BagSensor, camera_of
 from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics, topics_of
 from taichi_mrf.errors import DatasetError, naming
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples, upwards_at
 
@@ -67,7 +68,7 @@ def find_confidence(
     depth images have none, and why none is used although there is one. ``wanted`` is the topic, if the user
     named it. Raises DatasetError if that is none of the depth image's confidence."""
     reader = sensor.reader
-    beside = [name for name in topics_of(reader, *messages.IMAGES) if _beside(name, depth.name)]
+    beside = [name for name in topics_of(reader, *messages.IMAGES) if is_beside(name, depth.name)]
     if wanted:
         name = choose(reader, "confidence", wanted, beside, "topics of confidence")
         problem = _misfit(reader, name, camera)
@@ -87,8 +88,8 @@ def find_confidence(
     return Beside(reader, name, entries, _sigma_m), [f"confidence: {name}, as a sigma for each pixel{alone}"]
 
 
-def _beside(name: str, depth: str) -> bool:
-    """True if a topic's name is that of depth up to ``confidence`` in the place of ``depth``."""
+def is_beside(name: str, depth: str) -> bool:
+    """True if a topic's name is that of one of depth up to ``confidence`` in the place of ``depth``."""
     parts, of_depth = name.split("/"), depth.split("/")
     if PART not in parts or "depth" not in of_depth:
         return False
@@ -128,55 +129,62 @@ NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""
 
 
+ImuRow = tuple[float, ...]
+"""A measurement of an IMU in its own frame: stamp in seconds, angular rates, accelerations (7 numbers)."""
+
+
 @dataclass(frozen=True)
 class BagImu:
-    """The angular rates and accelerations of the camera, and upwards in its frame, (3,), at the first image;
-    None for what is not known. ``notes`` are for the user: which topic is used, or why none is although there
-    are some."""
+    """The IMU of a topic, mounted at ``T_optical_imu`` (4, 4); ``rows`` are what it measured."""
 
-    gyro: GyroSamples | None = None
-    acceleration: AccelerationSamples | None = None
-    up: NDArray[np.float64] | None = None
-    notes: list[str] = field(default_factory=list)
+    topic: str
+    T_optical_imu: Pose
+    rows: Sequence[ImuRow]
+
+    def samples(
+        self, rows: Iterable[ImuRow], later_s: float = 0.0
+    ) -> tuple[GyroSamples, AccelerationSamples | None]:
+        """The rates and accelerations of the camera by some rows, whose stamps count ``later_s`` later."""
+        table = np.array(list(rows)).reshape(-1, 7)
+        stamps, first = np.unique(table[:, 0] + later_s, return_index=True)
+        R_optical_imu = self.T_optical_imu[:3, :3]
+        rates, forces = (table[first, i : i + 3] @ R_optical_imu.T for i in (1, 4))
+        valid, known = (np.isfinite(each).all(axis=1) for each in (rates, forces))
+        felt = AccelerationSamples(stamps[known], forces[known], self.T_optical_imu[:3, 3])
+        return GyroSamples(stamps[valid], rates[valid]), felt if known.any() else None
 
 
-def find_imu(sensor: BagSensor, wanted: str, first_s: float) -> BagImu:
-    """The IMU beside a camera whose images begin at ``first_s``. ``wanted`` is the topic, if the user
-    named it. Raises DatasetError if that has no angular rates."""
+def imu_row(entry: Entry, message: Any) -> ImuRow:
+    """What a message of an IMU measures; accelerations are nan if it has none."""
+    rate, force = message.angular_velocity, message.linear_acceleration
+    felt = (force.x, force.y, force.z) if _measures(message, "linear_acceleration") else (np.nan,) * 3
+    return (entry.stamp, rate.x, rate.y, rate.z, *felt)
+
+
+def find_imu(sensor: BagSensor, wanted: str, first_s: float) -> tuple[BagImu | None, list[str]]:
+    """The IMU beside a camera whose images begin at ``first_s``, and notes for the user: which topic is used,
+    or why none is although there are some. ``wanted`` is the topic, if the user named it. Raises DatasetError
+    if that has no angular rates."""
     if wanted == NONE:
-        return BagImu()
+        return None, []
     reader = sensor.reader
     found = topics_of(reader, messages.IMU)
     topics = [name for name in found if _measures(reader.first(name), "angular_velocity")]
     if not wanted and len(topics) != 1:
-        return BagImu(notes=[f"imu: choose one with ?imu={' or ?imu='.join(topics)}"] if topics else [])
+        return None, [f"imu: choose one with ?imu={' or ?imu='.join(topics)}"] if topics else []
     name = choose(reader, "imu", wanted, topics, "topics of an IMU's angular rates")
     if name not in topics:
         raise DatasetError(f"{reader.path}: topic {name} has no angular rates ({messages.IMU})")
-    entries, rates, accelerations, frame, optical = [], [], [], "", sensor.frame
-    for entry, message in reader.messages(name):
-        rate, force = message.angular_velocity, message.linear_acceleration
-        entries.append(entry)
-        rates.append((rate.x, rate.y, rate.z))
-        felt = _measures(message, "linear_acceleration")
-        accelerations.append((force.x, force.y, force.z) if felt else (np.nan,) * 3)
-        frame = frame or entry.frame
+    found_rows = {entry: imu_row(entry, message) for entry, message in reader.messages(name)}
+    frame = next((entry.frame for entry in found_rows if entry.frame), "")
+    optical = sensor.frame
     T_optical_imu = np.eye(4) if frame == optical != "" else sensor.tree().mounted(optical, frame)
     if T_optical_imu is None:
-        why = f"tf has no fixed transform from {frame!r} to {optical!r}"
-        return BagImu(notes=[f"imu: {name} is not used: {why}"])
-    to_optical = T_optical_imu[:3, :3].T
-    part = list(sensor.run.part([entry.stamp for entry in entries], [entry.place for entry in entries]))
-    times, first = np.unique([entries[i].stamp for i in part], return_index=True)
-    rates_imu = np.array(rates)[part][first]
-    valid = np.isfinite(rates_imu).all(axis=1)
-    measured = np.array(accelerations)[part][first] @ to_optical
-    known = np.isfinite(measured).all(axis=1)
-    acceleration = AccelerationSamples(times[known], measured[known], T_optical_imu[:3, 3])
-    up = upwards_at(acceleration, first_s)
+        return None, [f"imu: {name} is not used: tf has no fixed transform from {frame!r} to {optical!r}"]
+    imu = BagImu(name, T_optical_imu, [found_rows[entry] for entry in sensor.run.of(list(found_rows))])
+    up = upwards_at(imu.samples(imu.rows)[1], first_s)
     level = "the first image is level by it" if up is not None else "which way is up it does not say"
-    gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
-    return BagImu(gyro, acceleration if known.any() else None, up, [f"imu: {name} measures turns; {level}"])
+    return imu, [f"imu: {name} measures turns; {level}"]
 
 
 def _measures(message: Any | None, what: str) -> bool:

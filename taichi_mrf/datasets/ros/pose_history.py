@@ -24,7 +24,7 @@ from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
-from taichi_mrf.datasets.ros.sources import Entry
+from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry
 from taichi_mrf.datasets.ros.tf import TransformTree, read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     FROM_TF,
@@ -128,7 +128,7 @@ def _from_paths(
     def version(number: int) -> ChangedPoses:
         found: dict[FrameKey, ArrayLike] = {}
         for each in reader.read(topic, entries[number]).poses:
-            stamp = messages.header_ns(each.header) / 1e9
+            stamp = messages.header_ns(each.header) / NANOSECONDS
             T_body_optical = tree.lookup(body, optical, stamp, INTERPOLATION_GAP)
             if T_body_optical is None:
                 continue

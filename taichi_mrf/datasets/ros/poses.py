@@ -23,7 +23,7 @@ from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.runs import BagRun
-from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
+from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.ros.tf import WORLDS, TransformTree, alternates
 from taichi_mrf.datasets.ros.topics import FROM_TF, choose, topics_of
@@ -312,7 +312,7 @@ def _read_poses(
     notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
     stamps = [0.0 if entry in unstamped else entry.stamp for entry, _ in found]
     if any(stamps) and not all(stamps):
-        times, wrong = mended_stamps([entry.recorded_ns / 1e9 for entry, _ in found], stamps)
+        times, wrong = mended_stamps([entry.recorded_ns / NANOSECONDS for entry, _ in found], stamps)
         found = [
             (replace(entry, stamp=time), pose)
             for (entry, pose), time in zip(found, times.tolist(), strict=True)
@@ -337,7 +337,7 @@ def _of_path(reader: TopicSource, name: str) -> Iterator[tuple[Entry, Any]]:
     """The poses of the last message of a Path, which has all of them."""
     for entry, message in deque(reader.messages(name), maxlen=1):
         for i, each in enumerate(message.poses):
-            stamp = header_ns(each.header) / 1e9 or entry.stamp
+            stamp = header_ns(each.header) / NANOSECONDS or entry.stamp
             frame = frame_name(each.header.frame_id) or entry.frame
             yield replace(entry, ordinal=i, stamp=stamp, frame=frame), each
 

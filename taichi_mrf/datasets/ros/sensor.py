@@ -44,6 +44,13 @@ class SensorChoice(PoseChoice):
     color: str = ""
     """The topic of colour images, by default the only one."""
 
+    confidence: str = ""
+    """The topic of images of confidence, by default the one beside that of depth."""
+
+    imu: str = ""
+    """The topic of an IMU whose angular rates help to track the camera (``poses=track``), by default the only
+    one; ``none`` for tracking without."""
+
     deskew: bool = True
     """Undo the lidar's motion during a scan, where points have times."""
 

@@ -13,6 +13,7 @@ from typing import Any
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 
 NANOSECONDS = 1_000_000_000
+"""In a second. Stamps are divided by this whole number: 1e9 would round those of today to 256 ns before."""
 
 Place = tuple[int, int]
 """The time of recording of a message in nanoseconds, and a number that grows along the recording."""

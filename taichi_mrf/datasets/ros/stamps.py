@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import header_ns
-from taichi_mrf.datasets.ros.sources import Entry, TopicSource
+from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, TopicSource
 from taichi_mrf.datasets.trajectories import RESTART_S
 
 _NEAR = 5
@@ -70,21 +70,22 @@ def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], li
         return [], []
     if len(entries) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in entries}) < len(entries):
         said = f"the stamps of {topic} stand still: the times of recording are taken"
-        return [replace(entry, stamp=entry.recorded_ns / 1e9) for entry in entries], [said]
+        return [replace(entry, stamp=entry.recorded_ns / NANOSECONDS) for entry in entries], [said]
     if sum(zero) > len(zero) - _LEAST and zero[0]:
         source, delay_s = _delay(reader, topic)
         said = f"the stamps of {topic} are 0: the times of recording are taken, "
         said += f"less the {delay_s:.3f} s of {source}" if source else "which are later"
         return [
-            replace(entry, stamp=entry.recorded_ns / 1e9 - delay_s) if unknown else entry
+            replace(entry, stamp=entry.recorded_ns / NANOSECONDS - delay_s) if unknown else entry
             for entry, unknown in zip(entries, zero, strict=True)
         ], [said]
     given = [0.0 if unknown else entry.stamp for entry, unknown in zip(entries, zero, strict=True)]
-    found, wrong = mended_stamps([entry.recorded_ns / 1e9 for entry in entries], given, repeated)
+    found, wrong = mended_stamps([entry.recorded_ns / NANOSECONDS for entry in entries], given, repeated)
     left_out = np.isnan(found)
     notes = []
     if taken := int((wrong & ~left_out).sum()):
-        delays = [e.recorded_ns / 1e9 - e.stamp for e, each in zip(entries, wrong, strict=True) if not each]
+        right = [entry for entry, each in zip(entries, wrong, strict=True) if not each]
+        delays = [entry.recorded_ns / NANOSECONDS - entry.stamp for entry in right]
         notes = [
             f"{taken} of {len(entries)} {what} of {topic} have a stamp that is 0, repeated or far off: their "
             f"times of recording are taken, less the usual {np.median(delays):.3f} s"
@@ -114,7 +115,7 @@ def _delay(reader: TopicSource, topic: str) -> tuple[str, float]:
         delays = []
         for entry, message in islice(reader.messages(each.name), _LOOKED_AT):
             headers = [part.header for part in getattr(message, "transforms", [message])]
-            delays += [entry.recorded_ns / 1e9 - header_ns(h) / 1e9 for h in headers if header_ns(h)]
+            delays += [(entry.recorded_ns - header_ns(h)) / NANOSECONDS for h in headers if header_ns(h)]
         if len(delays) >= _LEAST and 0 <= (delay_s := float(np.median(delays))) < _LONGEST_DELAY_S:
             return each.name, delay_s
     return "", 0.0

@@ -18,7 +18,7 @@ import numpy as np
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.runs import BagRun
-from taichi_mrf.datasets.ros.sources import Entry, TopicSource
+from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -293,7 +293,7 @@ def _sent_in(topic: str, entry: Entry, message: Any) -> Iterator[tuple[str, _Sen
             pose = as_pose(messages.pose_of(each))
         except KeyframeError:
             pose = np.full((4, 4), np.nan)  # an uninitialised transform, which leaves a gap
-        stamp = messages.header_ns(each.header) / 1e9
+        stamp = messages.header_ns(each.header) / NANOSECONDS
         if parent and child:
             yield child, _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.depth_scale import check_metres
 from taichi_mrf.datasets.entries import FOXGLOVE, ZENOH
 from taichi_mrf.datasets.lidar.scans import reach_of
@@ -30,10 +31,18 @@ from taichi_mrf.datasets.ros.bag import (
     summary_of,
     turned_axes,
 )
-from taichi_mrf.datasets.ros.beside import COLOR_GAP, find_colors
+from taichi_mrf.datasets.ros.beside import (
+    COLOR_GAP,
+    Beside,
+    find_colors,
+    find_confidence,
+    find_imu,
+    is_beside,
+)
 from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
+from taichi_mrf.datasets.ros.sources import Topic
 from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.datasets.wires.client import Client
 from taichi_mrf.datasets.wires.foxglove import FoxgloveClient
@@ -92,7 +101,7 @@ def summarise(source: str) -> BagSummary:
     """What a robot sends, from a few seconds of listening. Raises DatasetError."""
     heard, _ = _connected(source)
     try:
-        _listen(heard, _needed(heard, SensorChoice()))
+        _listen(heard, _needed(heard, SensorChoice(), color=True))
         return summary_of(heard)
     finally:
         heard.client.close()
@@ -117,15 +126,25 @@ def _connected(source: str) -> tuple[HeardTopics, SensorChoice]:
         raise
 
 
-def _needed(heard: HeardTopics, chosen: SensorChoice) -> list[str]:
-    """The topics that tell what is mapped; of images and clouds one only, if the user has named it."""
+def _needed(heard: HeardTopics, chosen: SensorChoice, color: bool) -> list[str]:
+    """The topics that tell what is mapped; of images and clouds, if the user has named one, that and what may
+    belong to it."""
     wanted = chosen.points or chosen.depth
-    named = wanted if wanted in heard.topics else f"/{wanted}"
+    types = (*NEEDED, messages.IMU) if chosen.poses == TRACK else NEEDED
+
+    def may_belong(topic: Topic) -> bool:
+        if topic.name.strip("/") == wanted.strip("/"):
+            return True
+        if chosen.points or topic.type not in messages.IMAGES:
+            return False
+        others = {name.strip("/") for name in (chosen.color, chosen.confidence) if name}
+        beside = not chosen.confidence and is_beside(topic.name, f"/{wanted.strip('/')}")
+        return topic.name.strip("/") in others or beside or (color and not chosen.color)
+
     return [
         topic.name
         for topic in heard.topics.values()
-        if topic.type in NEEDED
-        and (topic.type not in messages.OF_SENSORS or not wanted or topic.name == named)
+        if topic.type in types and (topic.type not in messages.OF_SENSORS or not wanted or may_belong(topic))
     ]
 
 
@@ -138,11 +157,10 @@ def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
 
 
 def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
-    _listen(heard, _needed(heard, chosen))
+    _listen(heard, _needed(heard, chosen, options.color))
     robot = _decided(heard, chosen, options)
     kept = [robot.sensor.topic]
-    if isinstance(robot, CameraRobot):
-        kept += [name for name in (robot.mapped.cameras.topic, robot.colors and robot.colors.topic) if name]
+    kept += robot.topics if isinstance(robot, CameraRobot) else []
     if chosen.poses != TRACK and not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
     heard.ask_for(kept)
@@ -167,27 +185,41 @@ def _parts(
 def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
     mapped = find_depth_camera(heard, chosen, options)
     depth, sensor, cameras, poses = mapped
-    gap, colors = COLOR_GAP if options.max_time_gap is None else options.max_time_gap, None
+    tracked, colors, imu = chosen.poses == TRACK, None, None
     if options.depth_scale is None:
         first = [heard.read(depth.name, entry) for entry in sensor.entries[:_LOOKED_AT]]
         check_metres(_readable(first), f"{heard.path}: topic {depth.name}")
     poses, said = _by_axes(heard, mapped, chosen, options)
+    stamps = [entry.stamp for entry in sensor.entries]
+    of_depth = (depth, cameras.first, stamps, options.max_time_gap)
     if options.color:
-        stamps = [entry.stamp for entry in sensor.entries]
-        colors, words = find_colors(sensor, chosen.color, depth, cameras.first, stamps, options.max_time_gap)
-        said += [each.partition(";")[0] if colors else each for each in words]
+        colors, words = find_colors(sensor, chosen.color, *of_depth)
+        said += _without_counts(words, colors)
+    confidences, words = find_confidence(sensor, chosen.confidence, *of_depth)
+    said += _without_counts(words, confidences)
+    if tracked:
+        imu, words = find_imu(sensor, chosen.imu, stamps[-1])
+        said += words
     parts = _parts(heard, sensor, poses, options)
     parts["notes"] += [*said, *cameras.notes]
     return CameraRobot(
         camera=cameras.first,
         distortion=cameras.distortion,
-        tracked=chosen.poses == TRACK,
+        tracked=tracked,
+        confidence=L515 if confidences else None,
         mapped=mapped,
         depth_scale=options.depth_scale,
         colors=colors,
-        color_gap=gap,
+        confidences=confidences,
+        beside_gap=COLOR_GAP if options.max_time_gap is None else options.max_time_gap,
+        imu=imu,
         **parts,
     )
+
+
+def _without_counts(notes: list[str], beside: Beside | None) -> list[str]:
+    """Notes of images that are used without how many of those that were heard so far have none."""
+    return [each.partition(";")[0] if beside else each for each in notes]
 
 
 def _readable(images: Iterable[Any]) -> list[NDArray[np.float32]]:
@@ -266,7 +298,8 @@ def _decided(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> 
             return find(heard, chosen, options)
         except DatasetError as error:
             if time.monotonic() > end:
-                silent = [name for name in _needed(heard, chosen) if not heard.topics[name].messages]
+                needed = _needed(heard, chosen, options.color)
+                silent = [name for name in needed if not heard.topics[name].messages]
                 said = f"; nothing came on {', '.join(silent)} in {heard.duration:.0f} s" if silent else ""
                 said += f"; {heard.problem}" if heard.problem else ""
                 raise DatasetError(f"{error}{said}") from error

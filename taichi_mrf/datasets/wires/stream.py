@@ -8,14 +8,17 @@ import math
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from taichi_mrf.datasets.base import Arrivals, Dataset, EndlessNames
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Arrivals, Dataset, EndlessNames, start_pose
 from taichi_mrf.datasets.lidar.scans import LidarRecording
-from taichi_mrf.datasets.ros.beside import COLOR_GAP, Beside
+from taichi_mrf.datasets.ros.beside import COLOR_GAP, BagImu, Beside, imu_row
 from taichi_mrf.datasets.ros.lidar import Clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera
@@ -25,7 +28,9 @@ from taichi_mrf.datasets.wires.client import MOST_IMAGES, wait_until
 from taichi_mrf.datasets.wires.heard import Heard, HeardTopics
 from taichi_mrf.errors import DatasetError, FrameError, naming
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.motion import MOST_SAMPLES, upwards_at
 
 LATE_S = 1.0
 """Poses come at most so much later than the largest gap allows; an image that has none by then gets none."""
@@ -42,14 +47,14 @@ SILENCE_S = 10.0
 
 class Posed(NamedTuple):
     """A message of the sensor: its number, what was heard, how much later than stamped it counts, as the
-    clock has started again, T_world_camera, (4, 4), None while it waits for that, and the colour image that
-    belongs to it."""
+    clock has started again, T_world_camera, (4, 4), None while it waits for that, and the images of other
+    topics that belong to it, by these."""
 
     number: int
     heard: Heard
     later_s: float
     pose: Pose | None = None
-    beside: Any = None
+    beside: Mapping[str, Any] = {}
 
 
 @dataclass
@@ -88,9 +93,9 @@ class Robot(Dataset):
         """The time in seconds up to which poses are needed for a message."""
         return entry.stamp
 
-    def complete(self, posed: Posed) -> Posed | None:
-        """A message with what belongs to it on other topics, None if that has yet to come."""
-        return posed
+    def complete(self, posed: Posed) -> tuple[Posed, bool]:
+        """A message with what belongs to it on other topics so far, and whether that has come."""
+        return posed, True
 
     def take_other(self, heard: Heard) -> None:
         """Take a message of another topic."""
@@ -223,54 +228,78 @@ class Robot(Dataset):
         """An image with what belongs to it, once that and the poses around it have come, or will not come any
         more; None before."""
         _, entry, message, arrived_s = image.heard
-        poses, whole = self.poses.get(entry.frame), self.complete(image)
-        if whole is not None and (poses is None or self.until(entry, message) <= poses.until):
-            return whole
-        return (whole or image) if self._newest_s - arrived_s > self.gap + LATE_S else None
+        poses, (image, is_whole) = self.poses.get(entry.frame), self.complete(image)
+        is_whole = is_whole and (poses is None or self.until(entry, message) <= poses.until)
+        return image if is_whole or self._newest_s - arrived_s > self.gap + LATE_S else None
 
 
 @dataclass
 class CameraRobot(Robot):
-    """The depth images of a robot that runs. ``colors`` says how the images of its topic become the colours
-    of those that are at most ``color_gap`` seconds apart."""
+    """The depth images of a robot that runs. ``colors`` and ``confidences`` say how images of their topics
+    become the colours and sigmas of those that are at most ``beside_gap`` seconds apart; ``imu`` tells how
+    a tracked camera moves."""
 
     mapped: DepthCamera = field(kw_only=True)
     depth_scale: float | None = None
     colors: Beside | None = None
-    color_gap: float = COLOR_GAP
+    confidences: Beside | None = None
+    beside_gap: float = COLOR_GAP
+    imu: BagImu | None = None
 
     def __post_init__(self) -> None:
-        kept = [] if self.colors is None else self.heard.kept(self.colors.topic)
-        self._colors: deque[Heard] = deque(kept, maxlen=MOST_IMAGES)
+        self._beside = {
+            each.topic: deque(self.heard.kept(each.topic), MOST_IMAGES)
+            for each in (self.colors, self.confidences)
+            if each is not None
+        }
+        self._measured = deque(self.imu.rows if self.imu else (), MOST_SAMPLES)
         super().__post_init__()
 
+    @property
+    def topics(self) -> list[str]:
+        """The topics that are heard besides that of depth and those of poses."""
+        found = [self.mapped.cameras.topic, *self._beside, self.imu.topic if self.imu else ""]
+        return [name for name in found if name]
+
     def load(self, posed: Posed, stamp: float, name: str) -> Frame:
-        """Decode an image, and its colours."""
-        assert posed.pose is not None
-        entry, message, color = posed.heard.entry, posed.heard.message, None
+        """Decode an image, its colours and its sigmas; a tracked camera that rests is level by its IMU."""
+        entry, message, T_world_camera = posed.heard.entry, posed.heard.message, posed.pose
+        assert T_world_camera is not None
+        gyro = acceleration = None
         where = f"{self.heard.path}: topic {self.sensor.topic}"
         depth_m, camera = self.mapped.cameras.measured(message, entry, self.depth_scale, where)
-        if self.colors is not None and posed.beside is not None:
-            with naming(f"{self.heard.path}: topic {self.colors.topic}"):
-                color = self.colors.decode(posed.beside, depth_m, camera)
-        return Frame(depth_m, posed.pose, camera, stamp, name, color)
+        color = self._decoded(self.colors, posed, depth_m, camera)
+        sigma_m = self._decoded(self.confidences, posed, depth_m, camera)
+        if self.imu is not None:
+            gyro, acceleration = self.imu.samples(self._measured, posed.later_s)
+            T_world_camera = start_pose(upwards_at(acceleration, stamp))
+        parts = (T_world_camera, camera, stamp, name, color, sigma_m)
+        return Frame(depth_m, *parts, gyro=gyro, acceleration=acceleration)
 
-    def complete(self, posed: Posed) -> Posed | None:
-        """With the colour image that is nearest in time."""
-        if self.colors is None:
-            return posed
-        stamp = posed.heard.entry.stamp
-        if not self._colors or max(each.entry.stamp for each in self._colors) < stamp:
-            return None
-        apart, nearest = min(
-            ((abs(each.entry.stamp - stamp), each.message) for each in self._colors), key=itemgetter(0)
-        )
-        return posed._replace(beside=nearest) if apart <= self.color_gap else posed
+    def complete(self, posed: Posed) -> tuple[Posed, bool]:
+        """With the images of other topics that are nearest in time; an IMU has measured until then."""
+        stamp, beside = posed.heard.entry.stamp, {}
+        is_whole = self.imu is None or (bool(self._measured) and self._measured[-1][0] >= stamp)
+        for topic, heard in self._beside.items():
+            is_whole &= any(each.entry.stamp >= stamp for each in heard)
+            apart, nearest = min(
+                ((abs(each.entry.stamp - stamp), each.message) for each in heard),
+                key=itemgetter(0),
+                default=(math.inf, None),
+            )
+            if apart <= self.beside_gap:
+                beside[topic] = nearest
+        return posed._replace(beside=beside), is_whole
 
     def take_other(self, heard: Heard) -> None:
-        """Take colours, and a CameraInfo, which may be another than before."""
-        if self.colors is not None and heard.topic.name == self.colors.topic:
-            self._colors.append(heard)
+        """Take images beside depth, what an IMU measured, and a CameraInfo, which may be another than
+        before."""
+        if heard.topic.name in self._beside:
+            self._beside[heard.topic.name].append(heard)
+        elif self.imu is not None and heard.topic.name == self.imu.topic:
+            if self._measured and heard.entry.stamp < self._measured[-1][0] - RESTART_S:
+                self._measured.clear()
+            self._measured.append(imu_row(heard.entry, heard.message))
         elif heard.topic.name == self.mapped.cameras.topic:
             since, said = self.mapped.cameras.hear(heard.entry, heard.message)
             first = [each.number for each in self._waiting if each.heard.entry.stamp >= since] or [self._came]
@@ -279,9 +308,20 @@ class CameraRobot(Robot):
                 self._news.setdefault("camera", f"{told}; later changes are taken, too")
 
     def forget_after(self, stamp: float) -> None:
-        """Drop colours, and times of cameras."""
-        self._colors = deque([each for each in self._colors if each.entry.stamp <= stamp], MOST_IMAGES)
+        """Drop images of other topics, and times of cameras."""
+        for topic, heard in self._beside.items():
+            self._beside[topic] = deque([e for e in heard if e.entry.stamp <= stamp], MOST_IMAGES)
         self.mapped.cameras.begin_again()
+
+    def _decoded(
+        self, beside: Beside | None, posed: Posed, depth_m: NDArray[np.float32], camera: PinholeCamera
+    ) -> NDArray[Any] | None:
+        """Colours or sigmas of a depth image's pixels, None without. Raises DatasetError, which names source
+        and topic."""
+        if beside is None or beside.topic not in posed.beside:
+            return None
+        with naming(f"{self.heard.path}: topic {beside.topic}"):
+            return beside.decode(posed.beside[beside.topic], depth_m, camera)
 
 
 @dataclass

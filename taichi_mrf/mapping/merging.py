@@ -1,0 +1,206 @@
+"""Several maps of one place as one map: each located in the others, then one pose graph over all overlaps.
+
+The first map stays where it is. A map that is not found in it may be found in another that was. Keyframes of
+two maps that see the same are aligned with each other, as where a loop is closed (loops.py), and the graph of
+these steps and of those within each map moves the keyframes of the later maps a little.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from taichi_mrf.alignment.oriented_points import oriented_points
+from taichi_mrf.alignment.pairs import fit_to
+from taichi_mrf.alignment.pose_graph import solve_pose_graph
+from taichi_mrf.alignment.rules import RULES
+from taichi_mrf.alignment.seen_through import looked_through
+from taichi_mrf.alignment.whole_map import LocatedRecording
+from taichi_mrf.config.registry import methods_with
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.pose_edge import PoseEdge
+from taichi_mrf.geometry.poses import Pose, as_pose, inverse, tangent_norms
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.mapping.loops import FREE
+from taichi_mrf.mapping.onto import free_prefix, locate
+from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.frame import Frame
+
+
+@dataclass(frozen=True)
+class Merged:
+    """One ``map`` of several, inferred. ``located`` is where each of the others lies in the first; ``loops``
+    is the number of measured steps between keyframes of different maps that are believed, and ``moved_m`` the
+    most that they have moved a keyframe against its own map, metres."""
+
+    map: MRFMap
+    located: tuple[LocatedRecording, ...]
+    loops: int
+    moved_m: float
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A keyframe of the map with a ``number``, which stands ``place``-th in it."""
+
+    number: int
+    place: int
+    keyframe: Keyframe
+
+
+def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
+    """Merge maps of one place; the first gives the world and the parameters. ``names`` are for messages.
+
+    Raises ConfigError for fewer than two maps, for one whose keyframes cannot be aligned or are frozen, and
+    DatasetError for one that is found in no other.
+    """
+    called = list(names) or [f"map {number}" for number in range(1, len(maps) + 1)]
+    parts = _checked(maps, called)
+    # Each map in the world of the first.
+    located = _located(parts, called)
+    T_first_map = [np.eye(4), *(_known(place) for place in located)]
+    nodes = [
+        _Node(number, place, keyframe)
+        for number, m in enumerate(parts)
+        for place, keyframe in enumerate(m.keyframes.values())
+    ]
+    placed = {n: T_first_map[node.number] @ node.keyframe.T_world_camera for n, node in enumerate(nodes)}
+    # The poses that fit the steps between the maps and the shape of each best.
+    loops = list(_steps_between(parts, nodes, placed))
+    worlds = {len(nodes) + number: T for number, T in enumerate(T_first_map)}
+    fixed = [len(nodes), *(n for n, node in enumerate(nodes) if node.number == 0)]
+    solution = solve_pose_graph(placed | worlds, [*_shapes(nodes), *loops], fixed)
+    trust = solution.trust[len(nodes) :]
+    # All keyframes in one map.
+    m = MRFMap.from_config(parts[0].config, nodes[0].keyframe.camera)
+    for number, part in enumerate(parts):
+        prefix = free_prefix(m, [keyframe.name for keyframe in part.keyframes.values()])
+        for n, node in enumerate(nodes):
+            if node.number == number:
+                _add(m, part, node.keyframe, as_pose(solution.poses[n]), prefix)
+    m.infer()
+    moved_m = max(tangent_norms(placed[n], solution.poses[n])[1] for n in range(len(nodes)))
+    return Merged(m, tuple(located), int((trust > RULES.trusted).sum()), moved_m)
+
+
+def _checked(maps: Sequence[OccupancyMap], names: Sequence[str]) -> list[MRFMap]:
+    if len(maps) < 2:
+        raise ConfigError("there is nothing to merge: pass two maps or more")
+    parts = []
+    for m, name in zip(maps, names, strict=True):
+        if not can_refine_poses(m):
+            needed = methods_with("can_refine_poses")
+            raise ConfigError(f"{name}: maps of the method {needed} can be merged, not {m.METHOD.name}")
+        if m.frozen:
+            raise ConfigError(f"{name}: {len(m.frozen)} keyframes are frozen, and have no images to merge")
+        parts.append(m)
+    return parts
+
+
+def _known(located: LocatedRecording) -> Pose:
+    assert located.T_map_recording is not None
+    return located.T_map_recording
+
+
+def _located(parts: Sequence[MRFMap], names: Sequence[str]) -> list[LocatedRecording]:
+    """Place of each map but the first in the world of that. Raises DatasetError."""
+    known: dict[int, LocatedRecording] = {0: LocatedRecording(np.eye(4))}
+    reasons: dict[int, str] = {}
+    asked: set[tuple[int, int]] = set()
+    while len(known) < len(parts):
+        pairs = [(i, j) for i in range(len(parts)) if i not in known for j in known if (i, j) not in asked]
+        if not pairs:
+            lost = min(set(range(len(parts))) - known.keys())
+            raise DatasetError(f"{names[lost]}: not found in any other map: {reasons[lost]}")
+        for number, other in pairs:
+            if number in known:
+                continue
+            asked.add((number, other))
+            found = locate(parts[other], [frame_of(each) for each in parts[number].keyframes.values()])
+            if found.T_map_recording is None:
+                reasons.setdefault(number, found.reason)
+            else:
+                T = _known(known[other]) @ found.T_map_recording
+                known[number] = replace(found, T_map_recording=T)
+    return [known[number] for number in range(1, len(parts))]
+
+
+def frame_of(keyframe: Keyframe) -> Frame:
+    """A keyframe of a map as the frame that it was."""
+    return Frame(
+        keyframe.depth_m,
+        keyframe.T_world_camera,
+        keyframe.camera,
+        keyframe.stamp_s,
+        keyframe.name,
+        color=keyframe.color,
+        sigma_m=keyframe.own.sigma_m,
+        noise=keyframe.own.noise,
+        no_return=keyframe.own.no_return,
+    )
+
+
+def _shapes(nodes: Sequence[_Node]) -> Iterator[PoseEdge]:
+    """The pose of each keyframe in the world of its own map, whose node comes after all keyframes."""
+    information = np.diag(np.repeat([RULES.merged_m, RULES.merged_rad], 3) ** -2.0)
+    for n, node in enumerate(nodes):
+        yield PoseEdge(len(nodes) + node.number, n, node.keyframe.T_world_camera, information)
+
+
+def _steps_between(
+    parts: Sequence[MRFMap], nodes: Sequence[_Node], placed: dict[int, Pose]
+) -> Iterator[PoseEdge]:
+    """Measured steps from keyframes of earlier maps to those of later ones that see the same."""
+    for n, node in enumerate(nodes):
+        points = None
+        for number in range(node.number):
+            near = _nearest(nodes, placed, n, number)
+            if near is None:
+                continue
+            if points is None:
+                image = node.keyframe.image
+                points = oriented_points(image, parts[node.number].sensor.max_depth).about(RULES.loop_points)
+            older, ids = nodes[near], list(parts[number].keyframes)
+            first = max(0, older.place - RULES.loop_neighbors)
+            surface = parts[number].aligner.surface.of(ids[first : older.place + RULES.loop_neighbors + 1])
+            T_other_first = older.keyframe.T_world_camera @ inverse(placed[near])
+            guess = T_other_first @ placed[n]
+            fit = fit_to(points, surface, [guess], FREE, RULES.loop_cells_m[0])
+            if fit is None or fit.directions < 6:
+                continue
+            if fit.overlap < RULES.loop_overlap or fit.agreement < RULES.loop_agreement:
+                continue
+            through = looked_through(surface.planes(), node.keyframe.image, fit.T_world_camera)
+            if through <= RULES.lost_through:
+                step = inverse(older.keyframe.T_world_camera) @ fit.T_world_camera
+                yield PoseEdge(near, n, step, fit.information, certain=False)
+
+
+def _nearest(nodes: Sequence[_Node], placed: dict[int, Pose], n: int, number: int) -> int | None:
+    """The keyframe of another map whose view is nearest to that of a keyframe, if they may see the same."""
+    best, least = None, np.inf
+    for k, other in enumerate(nodes):
+        if other.number == number:
+            turned_rad, apart_m = tangent_norms(placed[n], placed[k])
+            near = apart_m < RULES.view_m and turned_rad < RULES.view_rad
+            if near and turned_rad + apart_m < least:
+                best, least = k, turned_rad + apart_m
+    return best
+
+
+def _add(m: MRFMap, part: MRFMap, keyframe: Keyframe, T_world_camera: Pose, prefix: str) -> None:
+    """Add a keyframe of one of the maps, with what that map knew of its noise."""
+    own = keyframe.own
+    if own.noise is None and part.config.sensor != m.config.sensor:
+        own = replace(own, noise=part.noise)
+    m.add_keyframe(
+        keyframe.depth_m,
+        T_world_camera,
+        keyframe.camera,
+        f"{prefix}{keyframe.name}",
+        keyframe.stamp_s,
+        keyframe.color if m.config.color else None,
+        **own.arguments(),
+    )

@@ -1,0 +1,100 @@
+"""``taichi-mrf map --onto``: today's recording located in yesterday's map, or refused in one line."""
+
+import json
+from pathlib import Path
+
+import pytest
+from console import FAST, as_process, assert_refused, taichi_mrf
+
+import taichi_mrf as tm
+from taichi_mrf.runs.files import MAP_FILE, REPORT_FILE
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+YESTERDAY = "synthetic:room?frames=24&width=160&height=120"
+TODAY = "synthetic:room?frames=20&width=160&height=120&seed=3"
+
+
+@pytest.fixture(scope="module")
+def yesterday(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("yesterday")
+    done = taichi_mrf("map", YESTERDAY, "--out", folder, *FAST)
+    assert done.returncode == 0, done.stderr
+    return folder / MAP_FILE
+
+
+def test_today_goes_on_in_the_map_of_yesterday(yesterday: Path, tmp_path: Path) -> None:
+    before = yesterday.read_bytes()
+    done = as_process("map", TODAY, "--onto", yesterday, "--out", tmp_path, "--no-pictures")
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert "18 of them keyframes, which join 22 of the earlier map" in said
+    assert "% of what is seen agrees" in said
+    report = json.loads((tmp_path / REPORT_FILE).read_text())
+    assert (report["keyframes"], report["keyframes_before"]) == (40, 22)
+    assert report["onto"] == str(yesterday)
+    assert report["located"]["agreement"] > 0.9
+    assert report["voxel_size"] == 0.1
+    assert report["accuracy"]["frames"] == 2
+    assert len(tm.load_map(tmp_path / MAP_FILE).keyframes) == 40
+    assert yesterday.read_bytes() == before
+    # The folder holds this very run; one of another map is another run.
+    again = taichi_mrf("map", TODAY, "--onto", yesterday, "--out", tmp_path, "--no-pictures")
+    assert again.returncode == 0
+    assert "holds this run already" in again.stdout
+    assert_refused(taichi_mrf("map", TODAY, "--out", tmp_path, *FAST), "holds a run with another")
+
+
+def test_frozen_keyframes_of_yesterday_are_evidence(yesterday: Path, tmp_path: Path) -> None:
+    done = taichi_mrf("map", TODAY, "--onto", yesterday, "--frozen", "--out", tmp_path, "--no-pictures")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / REPORT_FILE).read_text())
+    assert (report["keyframes"], report["frozen"], report["keyframes_before"]) == (18, 22, 22)
+
+
+def test_another_place_is_refused_and_nothing_is_written(yesterday: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = taichi_mrf(
+        "map", "synthetic:corridor?frames=12&width=160&height=120", "--onto", yesterday, "--out", out
+    )
+    assert_refused(done, f"not found in {yesterday}: ")
+    assert not (out / MAP_FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (("--voxel-size", "0.02"), "made with another voxel_size"),
+        (("--refine-poses",), "--refine-poses moves keyframes"),
+        (("--noise", "auto"), "--noise auto does not work with --onto"),
+        (("--submap-size", "5"), "does not work with --submap-size"),
+    ],
+)
+def test_flags_that_do_not_go_with_it(
+    yesterday: Path, tmp_path: Path, flags: tuple[str, ...], says: str
+) -> None:
+    assert_refused(taichi_mrf("map", TODAY, "--onto", yesterday, "--out", tmp_path / "out", *flags), says)
+
+
+def test_frozen_needs_a_map_and_the_map_has_to_be_one(tmp_path: Path) -> None:
+    assert_refused(taichi_mrf("map", TODAY, "--frozen", "--out", tmp_path / "out"), "add --onto MAP")
+    done = taichi_mrf("map", TODAY, "--onto", tmp_path / "none.npz", "--out", tmp_path / "out")
+    assert_refused(done, "none.npz")
+
+
+def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:
+    done = taichi_mrf("map", TODAY, "--out", tmp_path / "today", *FAST)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "both.npz"
+    done = as_process("merge", yesterday, tmp_path / "today" / MAP_FILE, "--out", out)
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert "% of what is seen agrees" in said
+    assert "40 keyframes, " in said
+    assert len(tm.load_map(out).keyframes) == 40
+    again = taichi_mrf("merge", yesterday, tmp_path / "today" / MAP_FILE, "--out", out, "--json")
+    facts = json.loads(again.stdout)
+    assert facts["keyframes"] == 40
+    assert facts["loops"] > 5
+    assert_refused(taichi_mrf("merge", yesterday, "--out", out), "two maps or more")
+    assert_refused(taichi_mrf("merge", yesterday, yesterday, "--out", tmp_path / "out.ply"), ".npz")

@@ -1,0 +1,110 @@
+"""Maps of one room that were made in worlds of their own become one map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from two_days import CONFIG, COUNT, TODAY, YESTERDAY, recorded, turned_away
+
+import taichi_mrf as tm
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.mapping.merging import frame_of, merge
+from taichi_mrf.mapping.onto import locate
+from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.noise import PolynomialNoise
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+
+def made(indices: range, T_world_room: Pose | None = None, name: str = "frame") -> MRFMap:
+    m = map_sequence(recorded(indices, T_world_room, name=name), CONFIG).map
+    assert isinstance(m, MRFMap)
+    return m
+
+
+def test_two_maps_become_that_of_one_run() -> None:
+    merged = tm.merge([made(YESTERDAY), made(TODAY, turned_away(), "today")], ["a", "b"])
+    at_once = made(range(2 * COUNT))
+    assert len(merged.map.keyframes) == 2 * COUNT
+    poses = {k.name.split("-")[1]: k.T_world_camera for k in merged.map.keyframes.values()}
+    stamps = {k.name.split("-")[1]: k.stamp_s for k in merged.map.keyframes.values()}
+    for keyframe in at_once.keyframes.values():
+        number = keyframe.name.split("-")[1]
+        turned_rad, shifted_m = tangent_norms(keyframe.T_world_camera, poses[number])
+        assert shifted_m < 0.02
+        assert np.degrees(turned_rad) < 0.5
+        assert stamps[number] == keyframe.stamp_s
+    centres, _ = at_once.voxels()
+    agree = (merged.map.occupied_within(centres, CONFIG.voxel_size) > 0.5).mean()
+    assert agree > 0.98
+    assert merged.loops >= COUNT // 2
+    assert merged.moved_m < 0.02
+
+
+def test_loops_mend_a_map_that_is_bent() -> None:
+    """Each pose of today is off by 2 cm. Where both maps see the same, that is mended."""
+    bent = recorded(TODAY, turned_away(2), name="today")
+    random = np.random.default_rng(1)
+    for n, frame in enumerate(bent.frames):
+        T = frame.T_world_camera.copy()
+        T[:3, 3] += random.normal(0, 0.02, 3)
+        bent.frames[n] = replace(frame, T_world_camera=T)
+    m = map_sequence(bent, CONFIG).map
+    merged = merge([made(YESTERDAY), m])
+    T_room_today = merged.located[0].T_map_recording
+    assert T_room_today is not None
+    rigid, solved = [], []
+    true = {f.name: f.T_world_camera for f in recorded(TODAY, name="today").frames}
+    after = {k.name: k.T_world_camera for k in merged.map.keyframes.values()}
+    for keyframe in m.keyframes.values():
+        placed = T_room_today @ keyframe.T_world_camera
+        rigid.append(tangent_norms(true[keyframe.name], placed)[1])
+        solved.append(tangent_norms(true[keyframe.name], after[keyframe.name])[1])
+    assert np.mean(solved) < 0.7 * np.mean(rigid)
+
+
+def test_a_third_map_is_found_in_the_second() -> None:
+    """The first and the third map see other parts of the room."""
+    first, third = made(range(0, 6)), made(range(14, 20), turned_away(1), "third")
+    assert locate(first, [frame_of(k) for k in third.keyframes.values()]).T_map_recording is None
+    second = made(range(0, 20), turned_away(4), "second")
+    merged = merge([first, third, second])
+    true = {f.name: f.T_world_camera for f in recorded(range(14, 20), name="third").frames}
+    for keyframe in merged.map.keyframes.values():
+        if keyframe.name in true:
+            assert tangent_norms(true[keyframe.name], keyframe.T_world_camera)[1] < 0.04
+
+
+def test_the_same_names_and_another_noise_are_kept_apart() -> None:
+    a, b = made(YESTERDAY), made(YESTERDAY, turned_away())
+    wider = MRFMap(CONFIG.voxel_size, PolynomialNoise((0.03,)))
+    for keyframe in b.keyframes.values():
+        wider.add(frame_of(keyframe))
+    wider.infer()
+    merged = merge([a, wider])
+    names = [keyframe.name for keyframe in merged.map.keyframes.values()]
+    assert len(set(names)) == 2 * COUNT
+    assert sum(name.startswith("2:") for name in names) == COUNT
+    noises = [k.own.noise for k in merged.map.keyframes.values() if k.name.startswith("2:")]
+    assert all(isinstance(noise, PolynomialNoise) for noise in noises)
+    assert all(k.own.noise is None for k in merged.map.keyframes.values() if not k.name.startswith("2:"))
+
+
+def test_maps_that_cannot_be_merged_are_named() -> None:
+    a = made(YESTERDAY)
+    with pytest.raises(ConfigError, match="pass two maps"):
+        merge([a])
+    with pytest.raises(ConfigError, match=r"^b: maps of the method mrf can be merged, not log_odds"):
+        merge([a, LogOddsMap(0.1)], ["a", "b"])
+    elsewhere = made(TODAY)
+    for id, keyframe in list(elsewhere.keyframes.items()):
+        elsewhere.remove_keyframe(id)
+        elsewhere.add(replace(frame_of(keyframe), depth_m=np.full_like(keyframe.depth_m, 1.3)))
+    with pytest.raises(DatasetError, match=r"^b: not found in any other map: "):
+        merge([a, elsewhere], ["a", "b"])
+    a.freeze_keyframe(next(iter(a.keyframes)))
+    with pytest.raises(ConfigError, match=r"^a: 1 keyframes are frozen"):
+        merge([a, elsewhere], ["a", "b"])
