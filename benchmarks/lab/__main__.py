@@ -21,6 +21,7 @@ EXPERIMENTS = {
     "submaps": Entry("benchmarks.lab.submaps.corridor:run_submaps", (0.05,), needs_data=False),
     "surface": Entry("benchmarks.lab.surface:run_surface", (0.05, 0.02, 0.01)),
     "lidar": Entry("benchmarks.lab.lidar:run_lidar", (0.2, 0.1, 0.05)),
+    "located": Entry("benchmarks.lab.located:run_located", (0.05,)),
     "noise": Entry("benchmarks.lab.noise:run_noise", (), has_parts=True),
     "sensors": Entry("benchmarks.lab.sensors:run_sensors", (0.05,), needs_data=False),
     "trajectory": Entry("benchmarks.lab.trajectory.tables:run_trajectory", (0.05,), has_parts=True),
