@@ -111,6 +111,19 @@ with tm.publish(wall, port=0) as served:  # ws://127.0.0.1:8765 unless told
 # tm.show
 tm.show(m, browser=False)  # until Ctrl-C; in a notebook, below the cell
 
+# tm.locate
+tuesday = tm.open_dataset("synthetic:room?frames=8&width=80&height=60&seed=2")  # in whatever world
+located = tm.locate(m, tuesday)
+print(located.T_map_recording, f"{100 * located.sigma_m:.0f} cm", located.reason)
+
+# tm.merge
+other = tm.MRFMap(voxel_size=0.1)
+for frame in tuesday:
+    other.add(frame)
+other.infer()
+both = tm.merge([m, other])
+print(len(both.map.keyframes), "keyframes,", both.loops, "steps measured between the maps")
+
 # tm.open_dataset
 for frame in tm.open_dataset("synthetic:room?frames=2&width=80&height=60"):
     print(frame.name, frame.depth_m.shape, frame.T_world_camera[:3, 3])

@@ -18,21 +18,12 @@ from taichi_mrf.methods.chunked_part import MapPart, in_chunks, take_part
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.queries.change import STATES, MapChange, compare_maps
-from taichi_mrf.queries.changed_things import (
-    CORE_VOXELS,
-    ChangedThing,
-    amid_known,
-    find_changed_things,
-    without_slack,
-)
+from taichi_mrf.queries.changed_things import ChangedThing, things_between
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_folder
 
 MOST_THINGS = 20
 """Things that are printed, at most; the JSON has all."""
-
-REACH_M = 0.1
-"""Parts of a thing may be so far apart, in metres."""
 
 
 def run_diff(options: Diff) -> int:
@@ -45,7 +36,7 @@ def run_diff(options: Diff) -> int:
     found = compare_maps(a, b)
     report = diff_report(found, str(options.a), str(options.b), a.voxel_size)
     report["located"] = None if located is None else located.to_json()
-    report["things"] = [_thing(each) for each in _things(found, a, b)]
+    report["things"] = [_thing(each) for each in things_between(found, a, b)]
     if options.out is not None:
         report["changes"] = {
             "file": str(options.out),
@@ -56,13 +47,6 @@ def run_diff(options: Diff) -> int:
     else:
         _print(report)
     return 0
-
-
-def _things(found: MapChange, a: OccupancyMap | MapPart, b: OccupancyMap | MapPart) -> list[ChangedThing]:
-    """Things that appeared or left, the largest first, without surfaces that have shifted a little or that
-    one map has not seen."""
-    change = amid_known(without_slack(found, a, b), a, b)
-    return find_changed_things(change, a.voxel_size, CORE_VOXELS, max(REACH_M, a.voxel_size))
 
 
 def _thing(thing: ChangedThing) -> dict[str, Any]:

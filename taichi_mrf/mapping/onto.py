@@ -202,7 +202,7 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
     if dataset.tracked and dataset.endless:
         raise DatasetError(f"{dataset.name}: --onto needs a recording of it, or a camera that has poses")
     kept = deque[Frame]()
-    located = locate(m, dataset, kept.append if dataset.endless else lambda frame: None)
+    located = locate(m, dataset, keep=kept.append if dataset.endless else lambda frame: None)
     if located.T_map_recording is None:
         raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
     notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]

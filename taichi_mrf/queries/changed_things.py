@@ -34,6 +34,9 @@ together."""
 CORE_VOXELS = 16
 """A cluster is told of if so many of its voxels are further than the slack from all surfaces."""
 
+PARTS_M = 0.1
+"""Parts of one thing may be so far apart, in metres."""
+
 _BRICKS_AT_ONCE = 4096
 _STEPS_AT_ONCE = 16
 
@@ -204,3 +207,12 @@ def find_changed_things(
             box = mine.min(axis=0) * voxel_size, (mine.max(axis=0) + 1) * voxel_size
             things.append(ChangedThing(verb, len(mine), *box))
     return sorted(things, key=lambda thing: -thing.voxels)
+
+
+def things_between(change: MapChange, a: VoxelMap, b: VoxelMap) -> list[ChangedThing]:
+    """Things that appeared or left between two maps of other views, the largest first: without surfaces that
+    have shifted a little or that one map has not seen, and without sheets of less than three voxels, such as
+    a table's top that one of the maps has seen at a slant only."""
+    clear = amid_known(without_slack(change, a, b), a, b)
+    things = find_changed_things(clear, a.voxel_size, CORE_VOXELS, max(PARTS_M, a.voxel_size))
+    return [thing for thing in things if thing.size_m.min() > 2.5 * a.voxel_size]

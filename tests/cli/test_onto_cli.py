@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 from console import FAST, as_process, assert_refused, taichi_mrf
+from two_days import TODAY as TODAY_FRAMES
+from two_days import recorded, turned_away
 
 import taichi_mrf as tm
 from taichi_mrf.runs.files import MAP_FILE, REPORT_FILE
@@ -98,3 +100,21 @@ def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:
     assert facts["loops"] > 5
     assert_refused(taichi_mrf("merge", yesterday, "--out", out), "two maps or more")
     assert_refused(taichi_mrf("merge", yesterday, yesterday, "--out", tmp_path / "out.ply"), ".npz")
+
+
+def test_diff_of_a_map_and_one_of_the_next_day(yesterday: Path, tmp_path: Path) -> None:
+    """A map of a recording whose world is another is laid over the first."""
+    today = tm.MRFMap.from_config(tm.load_map(yesterday).config, recorded(TODAY_FRAMES).camera)
+    for frame in recorded(TODAY_FRAMES, turned_away()):
+        today.add(frame)
+    today.infer()
+    today.save(tmp_path / "today.npz")
+    done = taichi_mrf("diff", yesterday, tmp_path / "today.npz", "--json")
+    facts = json.loads(done.stdout)
+    assert facts["located"]["says"].endswith("% of what is seen agrees")
+    assert facts["known_in_both"] > 0.6 * (facts["only_in_a"] + facts["only_in_b"] + facts["known_in_both"])
+    assert facts["volume_in_both_m3"] == pytest.approx(facts["known_in_both"] * 0.1**3)
+    said = taichi_mrf("diff", yesterday, tmp_path / "today.npz").stdout
+    assert "B located in A: " in said
+    # The same world: compared as it stands, in words as before.
+    assert "located" not in taichi_mrf("diff", yesterday, yesterday).stdout
