@@ -6,7 +6,6 @@ had been taken in the same run.
 """
 
 import itertools
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.whole_map import LocatedRecording, Stretch, WholeMap, locate_stretch, walls_of
 from taichi_mrf.config.registry import methods_with
-from taichi_mrf.config.schema import Config
+from taichi_mrf.config.schema import Config, KeyframeConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.base import EndlessNames, StampedPoses
@@ -25,7 +24,8 @@ from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.geometry.up import up_vector
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
-from taichi_mrf.mapping.intake import Added, Intake
+from taichi_mrf.mapping.intake import Added, Intake, Lost, Passed
+from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -68,21 +68,24 @@ def parameters_onto(of_map: Config, asked: Config, default: Config, where: str) 
 
 
 ReadFrame = Callable[[int], Frame]
+Tell = Callable[[str], None]
 
 
 def locate(
     m: OccupancyMap,
     frames: Sequence[Frame] | Dataset,
     T_map_recording: Pose | None = None,
-    keep: Callable[[Frame], object] = lambda frame: None,
+    kept: dict[int, Frame] | None = None,
+    tell: Tell = lambda text: None,
 ) -> LocatedRecording:
     """Find a recording in a map whose keyframes were taken in the same place at another time.
 
     ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
-    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. ``keep`` is
-    called with each frame that is searched for: those of an endless dataset are not read again. The answer
-    has ``T_map_recording``, or None and a ``reason``. Raises ConfigError if keyframes cannot be aligned in a
-    map of this method, or if the map has none, and what reading frames raises.
+    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. Of an
+    endless dataset, ``kept`` gets the frames that are to be mapped, as they were read, by index, because they
+    are not read again, and ``tell`` is told how far the search is. The answer has ``T_map_recording``, or
+    None and a ``reason``. Raises ConfigError if keyframes cannot be aligned in a map of this method, or if
+    the map has none, and what reading frames raises.
     """
     if not can_refine_poses(m):
         raise ConfigError(
@@ -90,7 +93,10 @@ def locate(
             f"not {m.METHOD.name}"
         )
     whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
-    for stretch, names in _stretches(m, frames, keep):
+    for part in _stretches(m, frames, {} if kept is None else kept, tell):
+        images = [_image(m, frame) for frame in part]
+        stretch = Stretch(images, [frame.T_world_camera for frame in part], m.sensor.max_depth)
+        names = tuple(frame.name for frame in part)
         now = replace(locate_stretch(stretch, whole, T_map_recording), frames=names)
         if now.T_map_recording is not None:
             return now
@@ -114,21 +120,16 @@ def whole_map(m: MRFMap) -> WholeMap:
 
 
 def _stretches(
-    m: MRFMap, frames: Sequence[Frame] | Dataset, keep: Callable[[Frame], object]
-) -> Iterator[tuple[Stretch, tuple[str, ...]]]:
-    """Stretches of a recording, from its beginning and from further on, with the names of their frames."""
+    m: MRFMap, frames: Sequence[Frame] | Dataset, kept: dict[int, Frame], tell: Tell
+) -> Iterator[list[Frame]]:
+    """Stretches of a recording, from its beginning and from further on."""
     if not isinstance(frames, Dataset):
-        parts = _posed(frames.__getitem__, len(frames))
-    elif frames.tracked:
-        parts = _tracked(m, frames)
-    else:
-        parts = _posed(frames.read, len(frames), endless=frames.endless)
-    for part in parts:
-        for frame in part:
-            keep(frame)
-        images = [_image(m, frame) for frame in part]
-        stretch = Stretch(images, [frame.T_world_camera for frame in part], m.sensor.max_depth)
-        yield stretch, tuple(frame.name for frame in part)
+        return _posed(frames.__getitem__, len(frames))
+    if not frames.endless:
+        return _tracked(m, frames) if frames.tracked else _posed(frames.read, len(frames))
+    if frames.tracked:
+        return _tracked_live(m, frames, kept, tell)
+    return _posed(frames.read, len(frames), kept, tell)
 
 
 def _image(m: MRFMap, frame: Frame) -> DepthImage:
@@ -141,10 +142,13 @@ STANDS_S = 10.0
 what there is."""
 
 
-def _posed(read: ReadFrame, count: int, endless: bool = False) -> Iterator[list[Frame]]:
-    """Frames of a recording that has poses, in stretches that begin all along it, or as they come if it is
-    ``endless``. Broken frames are left out."""
-    last, ends = -1, 0 if endless else count
+def _posed(
+    read: ReadFrame, count: int, kept: dict[int, Frame] | None = None, tell: Tell = lambda text: None
+) -> Iterator[list[Frame]]:
+    """Frames of a recording that has poses, in stretches that begin all along it. With ``kept`` it is
+    endless: they are taken as they come, and put there. Broken frames are left out."""
+    last, endless = -1, kept is not None
+    ends = 0 if endless else count
     firsts = np.linspace(0, ends, RULES.whole_stretches, endpoint=False).astype(int)
     for first in firsts if endless else np.unique(firsts):
         part: list[Frame] = []
@@ -160,6 +164,9 @@ def _posed(read: ReadFrame, count: int, endless: bool = False) -> Iterator[list[
                 break  # nothing more comes, but there is something
             if _tells_more(part, frame):
                 part.append(frame)
+                if kept is not None:
+                    kept[index] = frame
+                    tell(_views(part))
             stands = endless and bool(part) and frame.stamp - part[-1].stamp > STANDS_S
             if len(part) == RULES.whole_frames or stands:
                 break
@@ -195,19 +202,70 @@ def _tracked(m: MRFMap, dataset: Dataset) -> Iterator[list[Frame]]:
         yield part
 
 
-def placed_in(m: OccupancyMap, name: str, dataset: Dataset) -> "Placed":
+MOST_KEPT = 100
+"""Frames of a tracked camera that runs are kept until it is located, at most."""
+
+KEPT_STEPS = KeyframeConfig(rotation=RULES.keyframe_rad / 4, translation=RULES.keyframe_m / 4)
+"""Motion from one kept frame to the next, short enough to be tracked; one that stands still is not kept."""
+
+
+def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tell) -> Iterator[list[Frame]]:
+    """Keyframes of a camera that runs and is tracked, in stretches, each in a map and a world of its own:
+    that of the first of its frames, which are ``kept`` as they came."""
+    intake: Intake | None = None
+    searched = 0
+    for index in range(len(dataset)):
+        if intake is None:
+            kept.clear()
+            part: list[Frame] = []
+            selector = KeyframeSelector(KEPT_STEPS)
+            intake = Intake(create_map(m.config, dataset.camera), m.config, tracked=True)
+            tell(_views(part))
+        try:
+            frame = dataset.read(index)
+            answer = intake.offer(frame, index + 1, index)
+        except FrameError:
+            continue
+        except DatasetError:
+            if not part:
+                raise
+            break  # nothing more comes, but there is something
+        if isinstance(answer, Added):
+            part.append(answer.frame)
+            tell(_views(part))
+        found = answer.frame if isinstance(answer, Added | Passed) else None
+        if part and found is not None and (found is part[-1] or selector.wants(found.T_world_camera)):
+            selector.accept(found.T_world_camera)
+            kept[index] = frame
+        if len(part) == RULES.whole_frames or len(kept) == MOST_KEPT:
+            tell("hold the camera still: what it has seen is looked for in the map")
+            yield part
+            searched += 1
+            if searched == RULES.whole_stretches:
+                return
+            tell("not found there: show the camera another part of the place")
+            intake = None
+        elif isinstance(answer, Lost) and answer.in_a_row > RULES.long_lost:
+            tell("the camera is lost, as it was moved too fast or sees too little: it begins again")
+            intake = None
+    yield part
+
+
+def _views(part: Sequence[Frame]) -> str:
+    return f"move the camera: {len(part)} of {RULES.whole_frames} views seen"
+
+
+def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda text: None) -> "Placed":
     """The frames of a dataset in the world of a map, with names that the map does not have, and later than
-    its newest keyframe if their clock begins before it. Raises DatasetError if the dataset is not found in
-    the map, which is called ``name``, or is a camera without poses that cannot be read twice."""
-    if dataset.tracked and dataset.endless:
-        raise DatasetError(f"{dataset.name}: --onto needs a recording of it, or a camera that has poses")
-    kept = deque[Frame]()
-    located = locate(m, dataset, keep=kept.append if dataset.endless else lambda frame: None)
+    its newest keyframe if their clock begins before it. ``tell`` is told what an endless one is waited for.
+    Raises DatasetError if the dataset is not found in the map, which is called ``name``."""
+    kept: dict[int, Frame] = {}
+    located = locate(m, dataset, kept=kept, tell=tell)
     if located.T_map_recording is None:
         raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
     notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]
     newest_s = max(keyframe.stamp_s for keyframe in m.keyframes.values())
-    first_s = kept[0].stamp if kept else float(dataset.stamps()[0])
+    first_s = next(iter(kept.values())).stamp if kept else float(dataset.stamps()[0])
     later_s = newest_s + NEXT_S - first_s if first_s < newest_s else 0.0
     if later_s:
         notes.append(f"Its clock begins before the newest keyframe of {name}: {later_s:.0f} s are added.")
@@ -245,18 +303,24 @@ class Placed(Derived):
     """The frames of ``source`` in the world of a map, where they were ``located``.
 
     ``prefix`` goes before their names, and ``later_s`` is added to their stamps. ``kept`` are the first
-    frames of an endless source, which was located by them.
+    frames of an endless source, by the index under which they were read, which was located by them. They can
+    be read again: a tracked camera begins where the first was taken.
     """
 
     located: LocatedRecording = field(kw_only=True)
     prefix: str = field(kw_only=True)
     later_s: float = field(kw_only=True)
     map_origin_m: NDArray[np.float64] = field(kw_only=True)
-    kept: deque[Frame] = field(kw_only=True, default_factory=deque)
+    kept: dict[int, Frame] = field(kw_only=True, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._first = list(self.kept.values())
+        self._left_out = max(self.kept, default=-1) + 1 - len(self.kept)
+        self._next = 0
 
     def awaiting(self) -> str:
         """What the source waits for, once the frames that were kept are read."""
-        return "" if self.kept else self.source.awaiting()
+        return "" if self._next < len(self._first) else self.source.awaiting()
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -295,7 +359,8 @@ class Placed(Derived):
 
     def read(self, index: int) -> Frame:
         """The source's frame, in the map. Raises what the source raises."""
-        frame = self.kept.popleft() if self.kept else self.source.read(index)
+        self._next, kept = index + 1, index < len(self._first)
+        frame = self._first[index] if kept else self.source.read(index + self._left_out)
         return replace(
             frame,
             T_world_camera=self.T_map_recording @ frame.T_world_camera,

@@ -218,7 +218,7 @@ def open_source(
         if dataset.endless:
             wait_for(f"waiting for views by which {name} is located in {onto}")
         m = load_map(onto, config.volume.memory_limit_gb)
-        dataset = placed_in(m, str(onto), dataset)
+        dataset = placed_in(m, str(onto), dataset, wait_for)
         new_map = partial(_earlier_map, [m], onto, config, frozen)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)

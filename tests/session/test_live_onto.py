@@ -5,7 +5,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -24,10 +24,11 @@ from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
-from taichi_mrf.mapping.onto import placed_in
+from taichi_mrf.mapping.onto import Placed, placed_in
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import Source, open_source
@@ -242,7 +243,7 @@ def test_the_frames_that_locate_a_robot_are_mapped_too_and_once(days: Days) -> N
     assert 1 < located_by < COUNT // 2
     names = []
     while not placed.awaiting():
-        frame = placed.read(0)
+        frame = placed.read(len(names))
         names.append(frame.name)
         assert frame.stamp > max(keyframe.stamp_s for keyframe in m.keyframes.values())
     assert names == [f"2:{frame.name}" for frame in frames()[1::2]]
@@ -284,7 +285,8 @@ def test_a_robot_goes_on_in_the_map_once_it_is_located(
         few = AT_ONCE | {"limit": 3}
         source, notes = open_source(sender.source, CONFIG, onto=days.map, wait_for=said.append, **few)
         thread.join()
-    assert said == [f"waiting for views by which {sender.source} is located in {days.map}"]
+    waiting = f"waiting for views by which {sender.source} is located in {days.map}"
+    assert said == [waiting, *(f"move the camera: {n} of 10 views seen" for n in range(1, len(said)))]
     assert any(note.startswith(f"Located in {days.map}: ") for note in notes)
     session = Session(source, FakeLink(), Policy(leave_when_done=True))
     joined = list(finished(session).keyframes.values())[COUNT // 2 :]
@@ -303,16 +305,100 @@ def test_a_robot_that_stands_still_is_located_by_what_it_sees(days: Days) -> Non
     placed = placed_in(load_map(days.map), "yesterday", robot)
     assert robot.came < 40
     assert placed.read(0).name == "2:0"
-    assert placed.read(0).name == f"2:{robot.came - 1}"  # the next that comes
+    assert placed.read(1).name == f"2:{robot.came - 1}"  # the next that comes
 
 
-def test_a_camera_that_runs_without_poses_is_refused_in_a_line(days: Days) -> None:
-    camera = replace(sensor(frames()[1::2]), tracked=True)
-    with pytest.raises(
-        DatasetError, match="robot: --onto needs a recording of it, or a camera that has poses"
-    ):
-        placed_in(load_map(days.map), "yesterday", camera)
-    assert camera.came == 0
+@dataclass
+class Camera(Sensor):
+    """A camera without poses that runs: names are those of the index."""
+
+    def read(self, index: int) -> Frame:
+        frame = super().read(index)
+        return replace(frame, T_world_camera=START, name=self.frame_names[index])
+
+
+START = away() @ np.eye(4)
+"""Pose that a camera without poses gives all its frames."""
+
+BETWEEN = 4
+"""Images of a camera from one of ``frames`` to the next."""
+
+
+@cache
+def carried() -> list[Frame]:
+    """The way of ``frames``, as a camera that is carried along sees it, from the second of them on."""
+    count = BETWEEN * COUNT
+    dataset = open_dataset(f"synthetic:room?frames={count}&width=160&height=120", color=False)
+    return [dataset.read(index) for index in range(BETWEEN, count // 2)]
+
+
+def camera(chosen: Sequence[Frame]) -> Camera:
+    return Camera("camera", chosen[0].camera, frames=chosen, tracked=True)
+
+
+def live(days: Days, placed: Placed, out: Path) -> tuple[Session, FakeLink]:
+    """A session that maps a camera which has been placed in yesterday's map, as long as images come."""
+    m, link, running = load_map(days.map), FakeLink(), placed.source
+    assert isinstance(running, Camera)
+    left = len(running.frames) - running.came
+    replay = partial(Replay, placed, limit=len(placed.kept) + left)
+    source = Source("camera", m.config, lambda: load_map(days.map), replay, True, placed)
+    return Session(source, link, Policy(out, leave_when_done=True)), link
+
+
+def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days, tmp_path: Path) -> None:
+    said: list[str] = []
+    still = [replace(carried()[0], stamp=-1.0 - i) for i in range(30, 0, -1)]
+    way = [*still, *carried()]
+    running = camera(way)
+    placed = placed_in(load_map(days.map), "yesterday", running, said.append)
+    located_by = running.came
+    assert len(still) < located_by < len(way)
+    assert said[:-1] == [f"move the camera: {n} of 10 views seen" for n in range(11)]
+    assert said[-1].startswith("hold the camera still")
+    assert len(placed.kept) < located_by - len(still) + 2  # while it stands, one is enough
+    session, link = live(days, placed, tmp_path)
+    m = finished(session)
+    track = session.state.result().track
+    assert track is not None
+    assert track.lost == 0
+    assert len(track.frames) == len(placed.kept) + len(way) - located_by
+    truth = {round(frame.stamp, 6): frame.T_world_camera for frame in way}
+    for stamp, T in track.trajectory(m):
+        off = np.linalg.inv(truth[round(stamp - placed.later_s, 6)]) @ T
+        assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
+    named = [keyframe.name for keyframe in list(m.keyframes.values())[COUNT // 2 :]]
+    assert len(set(named)) == len(named)
+    assert_shown_is(session, link)
+    # No more images come, and after a reset the camera begins where it began, not where it went.
+    link.ask(Reset())
+    session.run(lambda: session.state.replay.number == len(placed.kept))
+    again = session.state.result().track
+    for index, found in again.frames.items():
+        np.testing.assert_allclose(found.T_world_camera, track.frames[index].T_world_camera, atol=1e-3)
+
+
+def test_a_camera_that_is_lost_while_it_is_located_begins_again(days: Days) -> None:
+    said: list[str] = []
+    elsewhere = frames("synthetic:corridor")[:1] * 12
+    way = [*carried()[:12], *elsewhere, *carried()]
+    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(way)])
+    placed = placed_in(load_map(days.map), "yesterday", running, said.append)
+    lost = next(i for i, text in enumerate(said) if "begins again" in text)
+    assert said[lost + 1] == "move the camera: 0 of 10 views seen"
+    first = placed.read(0)
+    assert first.stamp - placed.later_s >= 0.1 * 12
+    off = np.linalg.inv(way[round(10 * (first.stamp - placed.later_s))].T_world_camera) @ first.T_world_camera
+    assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
+
+
+def test_a_camera_that_is_elsewhere_is_refused_in_a_line(days: Days) -> None:
+    elsewhere = open_dataset("synthetic:corridor?frames=80&width=160&height=120", color=False)
+    running = camera([elsewhere.read(index) for index in range(40)])
+    said: list[str] = []
+    with pytest.raises(DatasetError, match="camera: not found in yesterday: "):
+        placed_in(load_map(days.map), "yesterday", running, said.append)
+    assert any(text.startswith("not found there") for text in said)
 
 
 def test_the_command_writes_the_files_of_both_days(days: Days, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """The page's memory of keyframes: all that can be changed, and a bounded share of what is frozen."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -20,6 +22,13 @@ def bricks(roster: ShownKeyframes) -> set[tuple[int, ...]]:
     return {tuple(brick) for each in roster.crossed() for brick in each.tolist()}
 
 
+def places(roster: ShownKeyframes) -> np.ndarray:
+    """Where along x the camera's path leads, from line to line."""
+    lines = roster.way_m()[:, :, 0]
+    np.testing.assert_array_equal(lines[1:, 0], lines[:-1, 1])
+    return np.append(lines[:1, 0], lines[:, 1])
+
+
 def test_frozen_keyframes_are_forgotten_but_not_what_they_saw_nor_where_they_were() -> None:
     roster, forgotten = ShownKeyframes(), []
     for id in range(3 * MOST_FROZEN):
@@ -28,7 +37,7 @@ def test_frozen_keyframes_are_forgotten_but_not_what_they_saw_nor_where_they_wer
     assert forgotten == list(range(2 * MOST_FROZEN))
     assert sorted(roster.keyframes) == list(range(2 * MOST_FROZEN, 3 * MOST_FROZEN))
     assert bricks(roster) == {(x, 0, 0) for x in range(3 * MOST_FROZEN + 1)}
-    np.testing.assert_array_equal(roster.way_m()[:, 0], np.arange(3 * MOST_FROZEN))
+    np.testing.assert_array_equal(places(roster), np.arange(3 * MOST_FROZEN))
 
 
 def test_what_can_be_changed_is_never_forgotten() -> None:
@@ -43,7 +52,7 @@ def test_a_long_way_keeps_its_ends_and_its_order() -> None:
     count = 3 * MOST_WAYPOINTS
     for id in range(count):
         roster.put(keyframe(id, "frozen"))
-    way = roster.way_m()[:, 0]
+    way = places(roster)
     assert len(way) <= MOST_WAYPOINTS + MOST_FROZEN
     assert way[0] == 0
     assert way[-1] == count - 1
@@ -56,3 +65,11 @@ def test_a_keyframe_that_is_off_has_seen_nothing() -> None:
     roster.put(keyframe(1))
     roster.put(keyframe(1, "off"))
     assert bricks(roster) == set()
+
+
+def test_no_line_leads_from_an_earlier_day_to_today() -> None:
+    roster = ShownKeyframes()
+    for id in range(3 * MOST_FROZEN):
+        roster.put(replace(keyframe(id, "frozen"), earlier=id < 7))
+    steps = roster.way_m()[:, :, 0].tolist()
+    assert steps == [[id, id + 1] for id in range(3 * MOST_FROZEN - 1) if id != 6]

@@ -2,6 +2,7 @@
 camera's path, the current camera; and the target of a click into the scene: a voxel, or a pixel of a
 keyframe's picture."""
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -61,7 +62,7 @@ class ShownKeyframes:
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}
-        self._old_way: list[NDArray[np.float64]] = []
+        self._old_way: list[tuple[bool, NDArray[np.float64]]] = []  # of earlier maps or not
         self._old_crossed: list[NDArray[np.int32]] = []
         self._merged = 0
         self._every, self._forgotten = 1, 0
@@ -77,9 +78,12 @@ class ShownKeyframes:
         return forgotten
 
     def way_m(self) -> NDArray[np.float64]:
-        """The camera's path, (n, 3) in metres, world, oldest first; a long path is thinned out."""
-        known = [self.keyframes[id].T_world_camera[:3, 3] for id in sorted(self.keyframes)]
-        return np.array([*self._old_way, *known]).reshape(-1, 3)
+        """The camera's path, lines (n, 2, 3) in metres, world, oldest first; a long path is thinned out. None
+        leads from an earlier map's last keyframe to the first after it."""
+        known = [self.keyframes[id] for id in sorted(self.keyframes)]
+        way = [*self._old_way, *((each.earlier, each.T_world_camera[:3, 3]) for each in known)]
+        lines = [(a, b) for (before, a), (after, b) in itertools.pairwise(way) if before == after]
+        return np.array(lines, np.float64).reshape(-1, 2, 3)
 
     def crossed(self) -> list[NDArray[np.int32]]:
         """Bricks (n, 3) that rays of keyframes cross; keyframes that are off are left out."""
@@ -94,7 +98,7 @@ class ShownKeyframes:
             self._old_crossed = [np.unique(np.concatenate(self._old_crossed), axis=0).astype(np.int32)]
             self._merged = len(self._old_crossed[0])
         if self._forgotten % self._every == 0:
-            self._old_way.append(keyframe.T_world_camera[:3, 3])
+            self._old_way.append((keyframe.earlier, keyframe.T_world_camera[:3, 3]))
         self._forgotten += 1
         if len(self._old_way) > MOST_WAYPOINTS:
             self._old_way = self._old_way[::2]
@@ -151,9 +155,9 @@ class KeyframeLayer:
 
     def draw_way(self) -> None:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
-        points = self.roster.way_m()
-        if len(points) > 1:
-            draw_lines(self._scene, "/way", np.stack([points[:-1], points[1:]], axis=1), _WAY)
+        lines = self.roster.way_m()
+        if len(lines):
+            draw_lines(self._scene, "/way", lines, _WAY)
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
