@@ -370,12 +370,17 @@ def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days
     named = [keyframe.name for keyframe in list(m.keyframes.values())[COUNT // 2 :]]
     assert len(set(named)) == len(named)
     assert_shown_is(session, link)
-    # No more images come, and after a reset the camera begins where it began, not where it went.
+    # After a reset the camera begins where it began, although its next image is from where it went.
+    kept = len(placed.kept)
+    running.frames = [*way, way[-1]]
     link.ask(Reset())
-    session.run(lambda: session.state.replay.number == len(placed.kept))
+    session.run(lambda: running.came == len(way) + 1)
     again = session.state.result().track
-    for index, found in again.frames.items():
-        np.testing.assert_allclose(found.T_world_camera, track.frames[index].T_world_camera, atol=1e-3)
+    assert again is not None
+    assert set(range(kept)) <= set(again.frames)
+    for index in range(kept):
+        off = np.linalg.inv(track.frames[index].T_world_camera) @ again.frames[index].T_world_camera
+        assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
 
 
 def test_a_camera_that_is_lost_while_it_is_located_begins_again(days: Days) -> None:
@@ -394,11 +399,12 @@ def test_a_camera_that_is_lost_while_it_is_located_begins_again(days: Days) -> N
 
 def test_a_camera_that_is_elsewhere_is_refused_in_a_line(days: Days) -> None:
     elsewhere = open_dataset("synthetic:corridor?frames=80&width=160&height=120", color=False)
-    running = camera([elsewhere.read(index) for index in range(40)])
+    way = [elsewhere.read(index) for index in range(40)]
+    running = camera([*way, *way[::-1]])
     said: list[str] = []
     with pytest.raises(DatasetError, match="camera: not found in yesterday: "):
         placed_in(load_map(days.map), "yesterday", running, said.append)
-    assert any(text.startswith("not found there") for text in said)
+    assert sum(text.startswith("hold the camera still") for text in said) > 0, said
 
 
 def test_the_command_writes_the_files_of_both_days(days: Days, tmp_path: Path) -> None:
