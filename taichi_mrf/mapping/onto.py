@@ -211,7 +211,8 @@ KEPT_STEPS = KeyframeConfig(rotation=RULES.keyframe_rad / 4, translation=RULES.k
 
 def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tell) -> Iterator[list[Frame]]:
     """Keyframes of a camera that runs and is tracked, in stretches, each in a map and a world of its own:
-    that of the first of its frames, which are ``kept`` as they came."""
+    that of the first of its frames, which are ``kept`` as they came. None is searched for by fewer views: one
+    view of a wall fits many places."""
     intake: Intake | None = None
     searched = 0
     for index in range(len(dataset)):
@@ -226,10 +227,6 @@ def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tel
             answer = intake.offer(frame, index + 1, index)
         except FrameError:
             continue
-        except DatasetError:
-            if not part:
-                raise
-            break  # nothing more comes, but there is something
         if isinstance(answer, Added):
             part.append(answer.frame)
             tell(_views(part))
@@ -237,7 +234,10 @@ def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tel
         if part and found is not None and (found is part[-1] or selector.wants(found.T_world_camera)):
             selector.accept(found.T_world_camera)
             kept[index] = frame
-        if len(part) == RULES.whole_frames or len(kept) == MOST_KEPT:
+        if len(kept) > MOST_KEPT:  # moved to and fro: any two of them are near each other
+            for every_other in list(kept)[1::2]:
+                del kept[every_other]
+        if len(part) == RULES.whole_frames:
             tell("hold the camera still: what it has seen is looked for in the map")
             yield part
             searched += 1
@@ -248,7 +248,6 @@ def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tel
         elif isinstance(answer, Lost) and answer.in_a_row > RULES.long_lost:
             tell("the camera is lost, as it was moved too fast or sees too little: it begins again")
             intake = None
-    yield part
 
 
 def _views(part: Sequence[Frame]) -> str:

@@ -17,6 +17,7 @@ from inputs_bags import Bag, write_bag
 from live_scene import FakeLink, assert_shown_is, finished, last_status, marginals, never, shown
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.base import EndlessNames
@@ -24,7 +25,7 @@ from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
-from taichi_mrf.mapping.onto import Placed, placed_in
+from taichi_mrf.mapping.onto import MOST_KEPT, Placed, placed_in
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
@@ -397,14 +398,27 @@ def test_a_camera_that_is_lost_while_it_is_located_begins_again(days: Days) -> N
     assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
 
 
-def test_a_camera_that_is_elsewhere_is_refused_in_a_line(days: Days) -> None:
-    elsewhere = open_dataset("synthetic:corridor?frames=80&width=160&height=120", color=False)
-    way = [elsewhere.read(index) for index in range(40)]
-    running = camera([*way, *way[::-1]])
+def test_a_camera_in_another_place_is_refused_in_a_line(days: Days) -> None:
+    larger = [replace(frame, depth_m=1.5 * frame.depth_m) for frame in carried()]
+    running = camera([*larger, *larger[::-1]] * 4)
     said: list[str] = []
     with pytest.raises(DatasetError, match="camera: not found in yesterday: "):
         placed_in(load_map(days.map), "yesterday", running, said.append)
-    assert sum(text.startswith("hold the camera still") for text in said) > 0, said
+    assert sum(text.startswith("hold the camera still") for text in said) == RULES.whole_stretches
+
+
+def test_a_camera_that_ends_before_it_has_seen_enough_is_not_located(days: Days) -> None:
+    with pytest.raises(DatasetError, match="no image comes any more"):
+        placed_in(load_map(days.map), "yesterday", camera(carried()[:8]))
+
+
+def test_a_camera_that_is_moved_to_and_fro_keeps_few_frames(days: Days) -> None:
+    way = [*(carried()[:2] * 90), *carried()[2:]]
+    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(way)])
+    placed = placed_in(load_map(days.map), "yesterday", running)
+    assert running.came > 180
+    assert 10 <= len(placed.kept) <= MOST_KEPT
+    assert next(iter(placed.kept)) == 0
 
 
 def test_the_command_writes_the_files_of_both_days(days: Days, tmp_path: Path) -> None:
