@@ -274,23 +274,17 @@ def _merged(experiment: Experiment, voxel_size: float) -> Table:
         m = Yesterday(source, voxel_size, [i for i in mapped if i < last]).map
         frames = [dataset.read(i) for i in judged if i < last]
         if last < count:
-            today = range(last, count)
-            placed = placed_in(m, "the first half", moved_away(chosen(dataset, today), (0,)))
-            for i in today:
-                frame = placed.read(i - last)
-                if i in judged:
-                    frames.append(frame)
-                else:
-                    m.add(frame)
+            today = chosen(dataset, range(last, count))
+            placed = placed_in(m, "the first half", moved_away(today, (0,)))
+            frames += [placed.read(i - last) for i in judged if i >= last]
+            for i in mapped:
+                if i >= last:
+                    m.add(placed.read(i - last))
         m.infer()
         error = pooled_depth_error(
             (m.render_depth(f.camera, f.T_world_camera), surface_depth(f, m.noise)) for f in frames
         )
-        rows.append(
-            [
-                name, len(m.keyframes), len(frames), f"{1000 * error.median_abs:.2f}",
-                f"{1000 * error.rms:.1f}", f"{100 * error.unanswered:.2f}",
-            ]
-        )  # fmt: skip
+        figures = f"{1000 * error.median_abs:.2f}", f"{1000 * error.rms:.1f}", f"{100 * error.unanswered:.2f}"
+        rows.append([name, len(m.keyframes), len(frames), *figures])
     columns = ["kitchen", "keyframes", "held-out frames", "median error mm", "RMS mm", "unanswered %"]
     return Table("located_maps", "A map of two days beside that of one run", columns, rows)
