@@ -82,6 +82,10 @@ def test_frozen_needs_a_map_and_the_map_has_to_be_one(tmp_path: Path) -> None:
     assert_refused(taichi_mrf("map", TODAY, "--frozen", "--out", tmp_path / "out"), "add --onto MAP")
     done = taichi_mrf("map", TODAY, "--onto", tmp_path / "none.npz", "--out", tmp_path / "out")
     assert_refused(done, "none.npz")
+    chunks = tmp_path / "map.zarr"
+    done = taichi_mrf("map", TODAY, "--onto", chunks, "--out", tmp_path / "out")
+    assert_refused(done, "a map in chunks has no keyframes")
+    assert_refused(taichi_mrf("merge", chunks, chunks, "--out", tmp_path / "out.npz"), "a map in chunks")
 
 
 def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:
