@@ -7,7 +7,7 @@ stretches. Held-out frames judge what is mapped in a place that was found.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import permutations
@@ -29,7 +29,7 @@ from taichi_mrf.evaluation.held_out import pooled_depth_error, surface_depth
 from taichi_mrf.evaluation.tables import Entry, Table, as_csv, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.geometry.poses import tangent_norms
 from taichi_mrf.mapping.onto import Placed, locate, placed_in, whole_map
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -98,20 +98,19 @@ class Yesterday:
             m.add(dataset.read(index))
         return m
 
-    def search(self, dataset: Dataset, first: int, last: int | None, seed: Sequence[int]) -> Result:
-        """Where some frames are found that have been moved away, how far that is from the truth if they are
-        of the same recording, and what it takes."""
-        m, T_away = self.map, turned(seed)
-        today = chosen(dataset, range(first, len(dataset) if last is None else last))
+    def search(self, today: Dataset, seed: Sequence[int]) -> Result:
+        """Where frames are found that have been moved away, how far that is from the truth if they are of the
+        same recording, and what it takes."""
+        m, away = self.map, moved_away(today, seed)
         reset_peak_memory()
         before_mb, start = peak_memory_mb() or 0.0, time.process_time()
-        found = locate(m, moved_away(today, T_away))
+        found = locate(m, away)
         seconds, mb = time.process_time() - start, (peak_memory_mb() or 0.0) - before_mb
         answer = {"seconds": seconds, "mb": mb, "reason": found.reason, "through": found.through}
         if found.T_map_recording is None:
             return answer
         middle = today.pose(list(today.frame_names).index(found.frames[len(found.frames) // 2]))
-        off_rad, off_m = tangent_norms(middle, found.T_map_recording @ T_away @ middle)
+        off_rad, off_m = tangent_norms(middle, found.T_map_recording @ away.T_map_recording @ middle)
         return answer | {
             "off_m": off_m,
             "off_degrees": float(np.degrees(off_rad)),
@@ -119,11 +118,11 @@ class Yesterday:
             "sigma_degrees": float(np.degrees(found.sigma_rad)),
         }
 
-    def shows(self, dataset: Dataset, first: int, last: int) -> Result:
-        """The share of what some frames measure that lies within a voxel, and 10 cm, of the map's surface."""
+    def shows(self, today: Dataset) -> Result:
+        """The share of what frames measure that lies within a voxel, and 10 cm, of the map's surface."""
         surface = whole_map(self.map).surface.planes()
         shown, tree = [], cKDTree(surface.points_m)
-        for frame in (dataset.read(i) for i in range(first, last)):
+        for frame in (today.read(i) for i in range(len(today))):
             points = points_of(frame, self.map.sensor.max_depth)
             away_m, nearest = tree.query(points, distance_upper_bound=2 * self.voxel_size)
             met = np.isfinite(away_m)
@@ -133,24 +132,14 @@ class Yesterday:
         return {"share": float(np.mean(shown))}
 
 
-def turned(seed: Sequence[int]) -> Pose:
-    """(4, 4): any turn, and up to 5 m along each axis."""
+def moved_away(dataset: Dataset, seed: Sequence[int]) -> Placed:
+    """A recording in a world of its own: under any turn, and up to 5 m along each axis."""
     rng, T = np.random.default_rng(seed), np.eye(4)
     T[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     T[:3, 3] = rng.uniform(-5, 5, 3)
-    return T
-
-
-def moved_away(dataset: Dataset, T_away: Pose) -> Placed:
-    """A recording in a world of its own."""
+    here, name = LocatedRecording(T), dataset.name
     return Placed(
-        dataset.name,
-        dataset.camera,
-        source=dataset,
-        located=LocatedRecording(T_away),
-        prefix="",
-        later_s=0.0,
-        map_origin_m=np.zeros(3),
+        name, dataset.camera, source=dataset, located=here, prefix="", later_s=0.0, map_origin_m=np.zeros(3)
     )
 
 
@@ -166,21 +155,21 @@ def points_of(frame: Frame, max_depth: float) -> NDArray[np.float64]:
 def run_located(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """Where recordings are found, which are refused, and maps of two days beside those of one run."""
     (voxel_size,) = experiment.voxel_sizes
-    rows: list[list[Entry]] = []
-    for name, results in (*_same_places(experiment, voxel_size), *_other_places(experiment, voxel_size)):
-        if results:
-            rows.append([name, *_entries(results)])
+    tries = (*_same_places(experiment, voxel_size), *_other_places(experiment, voxel_size))
     columns = [
-        "recording", "tries", "located", "near", "wrong", "refused", "worst cm", "worst degrees", "sigma cm",
-        "error^2 / sigma^2", "seconds", "at most", "MB",
+        "recording", "tries", *GRADES, "worst cm", "worst degrees", "sigma cm", "error^2 / sigma^2",
+        "seconds", "at most", "MB",
     ]  # fmt: skip
-    notes = [
+    rows = [[name, *_entries(results)] for name, results in tries if results]
+    note = (
         f"located: within {100 * RIGHT_M:g} cm and {RIGHT_DEGREES:g} degrees; wrong: beyond "
         f"{100 * WRONG_M:g} cm or {WRONG_DEGREES:g} degrees; near: between. error^2 / sigma^2: means of the "
-        "squares of the place's error over its variance, and of the turn's. Seconds of all threads.",
+        "squares of the place's error over its variance, and of the turn's. Seconds of all threads."
+    )
+    tables = [
+        Table("located", "Recordings found in a map of another day", columns, rows, [note]),
+        _merged(experiment, voxel_size),
     ]
-    tables = [Table("located", "Recordings found in a map of another day", columns, rows, notes)]
-    tables.append(_merged(experiment, voxel_size))
     paths = [path for table in tables for path in write_table(experiment.out, table)]
     if experiment.limit is None:
         for table in tables:
@@ -194,26 +183,26 @@ Tries = Iterator[tuple[str, list[Result]]]
 def _same_places(experiment: Experiment, voxel_size: float) -> Tries:
     """Tries in a map of every second frame, and of the first half."""
     for name, place, factor, most in HALVES:
-        source = place if ":" in place else str(experiment.data / place)
-        dataset, size = open_dataset(source), factor * voxel_size
+        source, size = _source(experiment, place), factor * voxel_size
+        dataset = open_dataset(source)
         count, half = len(dataset), len(dataset) // 2
         parts = {"second half": (range(half), range(half, count))}
         if name != "kitchen":
             parts["every second frame"] = (range(0, count, 2), range(1, count, 2))
         for part, (mapped, asked) in parts.items():
-            yesterday, today = Yesterday(source, size, mapped), chosen(dataset, asked)
+            yesterday, number = Yesterday(source, size, mapped), min(most, experiment.limit or most)
             here: list[Result] = []
             elsewhere: list[Result] = []
-            number = min(most, experiment.limit or most)
-            ends = np.linspace(RULES.whole_frames, len(today), number).astype(int)
-            for i, last in enumerate(ends.tolist()):
+            for i, last in enumerate(
+                np.linspace(RULES.whole_frames, len(asked), number).astype(int).tolist()
+            ):
                 first = last - RULES.whole_frames
+                today = chosen(dataset, asked[first:last])
                 key = f"{place} | {size:g} m | {part} | {first} | {i}"
                 experiment.report(key, i, number)
-                work = partial(yesterday.search, today, first, last, (experiment.seeds[0], i))
+                work = partial(yesterday.search, today, (experiment.seeds[0], i))
                 result = experiment.ledger.result(key, work)
-                work = partial(yesterday.shows, today, first, last)
-                shown = experiment.ledger.result(f"{key} | shown", work)
+                shown = experiment.ledger.result(f"{key} | shown", partial(yesterday.shows, today))
                 (here if shown["share"] > OVERLAP else elsewhere).append(result)
             yield f"{name}, {part}", here
             yield f"{name}, another part", elsewhere
@@ -223,58 +212,59 @@ def _other_places(experiment: Experiment, voxel_size: float) -> Tries:
     """Recordings of other places: of each room in the maps of all others, and of the building by lidar in
     the maps of other lidars, and the other way around."""
     for name, places, size in (("room", ROOMS, voxel_size), ("place by lidar", LIDARS, 4 * voxel_size)):
-        sources = {key: each if ":" in each else str(experiment.data / each) for key, each in places.items()}
-        maps = {place: Yesterday(source, size) for place, source in sources.items()}
+        maps = {place: Yesterday(_source(experiment, each), size) for place, each in places.items()}
         results: list[Result] = []
-        for number, (place, other) in enumerate(permutations(sources, 2)):
-            if not _differ(place, other) or len(results) == experiment.limit:
+        for number, (place, other) in enumerate(permutations(maps, 2)):
+            both = {place, other}
+            if both == COPIES or (place in LIDARS and "building" not in both):
                 continue
-            dataset, i = open_dataset(sources[other]), list(sources).index(other)
+            dataset, i = open_dataset(maps[other].source), list(maps).index(other)
             first = int(np.random.default_rng((number, i)).integers(max(1, len(dataset) // 2)))
             key = f"{place} | {other} | {size:g} m | {first}"
-            experiment.report(key, len(results), len(sources) * (len(sources) - 1))
-            work = partial(maps[place].search, dataset, first, None, (experiment.seeds[0], i))
+            experiment.report(key, number, len(maps) * (len(maps) - 1))
+            today = chosen(dataset, range(first, len(dataset)))
+            work = partial(maps[place].search, today, (experiment.seeds[0], i))
             results.append(experiment.ledger.result(key, work))
+            if len(results) == experiment.limit:
+                break
         yield f"another {name}", results
 
 
-def _differ(place: str, other: str) -> bool:
-    """True for two places, but not for two lidars without the building."""
-    both = {place, other}
-    return (place in ROOMS or "building" in both) and both != COPIES
+def _source(experiment: Experiment, place: str) -> str:
+    return place if ":" in place else str(experiment.data / place)
+
+
+GRADES = ("located", "near", "wrong", "refused")
+
+
+def _grade(result: Result) -> str:
+    if "off_m" not in result:
+        return "refused"
+    off_m, off_degrees = result["off_m"], result["off_degrees"]
+    if off_m < RIGHT_M and off_degrees < RIGHT_DEGREES:
+        return "located"
+    return "wrong" if off_m > WRONG_M or off_degrees > WRONG_DEGREES else "near"
 
 
 def _entries(results: Sequence[Result]) -> list[Entry]:
     """The columns of some tries."""
-    found = [r for r in results if "off_m" in r]
-    right = [r for r in found if r["off_m"] < RIGHT_M and r["off_degrees"] < RIGHT_DEGREES]
-    wrong = [r for r in found if r["off_m"] > WRONG_M or r["off_degrees"] > WRONG_DEGREES]
-    kept = [r for r in found if r not in wrong]
-    squares = [[(r["off_m"] / r["sigma_m"]) ** 2, (r["off_degrees"] / r["sigma_degrees"]) ** 2] for r in kept]
-    seconds = [r["seconds"] for r in results]
-    return [
-        len(results),
-        len(right),
-        len(found) - len(right) - len(wrong),
-        len(wrong),
-        len(results) - len(found),
-        _figure(max, [100 * r["off_m"] for r in kept]),
-        _figure(max, [r["off_degrees"] for r in kept]),
-        _figure(np.mean, [100 * r["sigma_m"] for r in kept]),
-        "{:.2f}, {:.2f}".format(*np.mean(squares, axis=0)) if kept else "-",
-        _figure(np.mean, seconds),
-        _figure(max, seconds),
-        f"{max(r['mb'] for r in results):.0f}",
-    ]
-
-
-def _figure(of: Callable[[Sequence[float]], float], values: Sequence[float]) -> str:
-    return f"{of(values):.1f}" if values else "-"
+    grades = [_grade(result) for result in results]
+    kept = [r for r, grade in zip(results, grades, strict=True) if grade in ("located", "near")]
+    seconds = [result["seconds"] for result in results]
+    figures = ["-"] * 4
+    if kept:
+        names = ("off_m", "off_degrees", "sigma_m", "sigma_degrees")
+        off_m, off_degrees, sigma_m, sigma_degrees = np.array([[r[name] for name in names] for r in kept]).T
+        squares = [np.mean((off_m / sigma_m) ** 2), np.mean((off_degrees / sigma_degrees) ** 2)]
+        figures = [f"{x:.1f}" for x in (100 * off_m.max(), off_degrees.max(), 100 * sigma_m.mean())]
+        figures.append("{:.2f}, {:.2f}".format(*squares))
+    costs = [f"{np.mean(seconds):.1f}", f"{max(seconds):.1f}", f"{max(r['mb'] for r in results):.0f}"]
+    return [len(results), *(grades.count(grade) for grade in GRADES), *figures, *costs]
 
 
 def _merged(experiment: Experiment, voxel_size: float) -> Table:
     """The kitchen mapped in one run, and its second half onto a map of the first."""
-    source = str(experiment.data / KITCHEN)
+    source = _source(experiment, KITCHEN)
     dataset = open_dataset(source)
     count, every = len(dataset), Config().evaluation.hold_out
     judged = [i for i in range(count) if is_held_out(i + 1, every)]
@@ -284,23 +274,17 @@ def _merged(experiment: Experiment, voxel_size: float) -> Table:
         m = Yesterday(source, voxel_size, [i for i in mapped if i < last]).map
         frames = [dataset.read(i) for i in judged if i < last]
         if last < count:
-            today = range(last, count)
-            placed = placed_in(m, "the first half", moved_away(chosen(dataset, today), turned((0,))))
-            for i in today:
-                frame = placed.read(i - last)
-                if i in judged:
-                    frames.append(frame)
-                else:
-                    m.add(frame)
+            today = chosen(dataset, range(last, count))
+            placed = placed_in(m, "the first half", moved_away(today, (0,)))
+            frames += [placed.read(i - last) for i in judged if i >= last]
+            for i in mapped:
+                if i >= last:
+                    m.add(placed.read(i - last))
         m.infer()
         error = pooled_depth_error(
             (m.render_depth(f.camera, f.T_world_camera), surface_depth(f, m.noise)) for f in frames
         )
-        rows.append(
-            [
-                name, len(m.keyframes), len(frames), f"{1000 * error.median_abs:.2f}",
-                f"{1000 * error.rms:.1f}", f"{100 * error.unanswered:.2f}",
-            ]
-        )  # fmt: skip
+        figures = f"{1000 * error.median_abs:.2f}", f"{1000 * error.rms:.1f}", f"{100 * error.unanswered:.2f}"
+        rows.append([name, len(m.keyframes), len(frames), *figures])
     columns = ["kitchen", "keyframes", "held-out frames", "median error mm", "RMS mm", "unanswered %"]
     return Table("located_maps", "A map of two days beside that of one run", columns, rows)

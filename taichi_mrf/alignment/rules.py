@@ -196,7 +196,8 @@ class Rules:
     """Width of the last level's cells in a whole map, metres."""
 
     whole_aside_m: float = 3.0
-    """Metres aside from the cameras of a map within which another camera is searched for."""
+    """Metres aside from the cameras of a map within which another camera is searched for, or the median of
+    its ranges, if that is more: from further away it sees little of what they saw."""
 
     whole_rise_m: float = 1.0
     """Metres above and below them."""

@@ -162,6 +162,11 @@ class Stretch:
         self.around = sees_around(images[0].camera)
         self._sights = [Sightlines.of(image) for image in images] if self.around else []
 
+    @cached_property
+    def lever_m(self) -> float:
+        """Distance of a typical point, metres."""
+        return float(np.median(np.linalg.norm(self.points.points, axis=1)))
+
     def points_from(self, T_map_scan: Pose) -> NDArray[np.float64]:
         """The points (N, 3), in metres in the map, from a pose (4, 4)."""
         return self.points.points.astype(np.float64) @ T_map_scan[:3, :3].T + T_map_scan[:3, 3]
@@ -204,14 +209,13 @@ def locate_stretch(
         poses = _candidates(stretch, whole)
     else:
         poses = [T_map_recording @ stretch.T_recording_scan]
-    # 2. From coarse to fine, the best of them.
-    lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
 
+    # 2. From coarse to fine, the best of them.
     def aligned(grid: SurfelGrid, every: int, poses: Sequence[Pose]) -> list[FoundPose]:
         problem = PointToPlane(points.chosen(slice(None, None, every)), grid)
         found = []
         for T in poses:
-            end = align(problem, T, Recorded(T, FREE), lever_m, RULES.observable)
+            end = align(problem, T, Recorded(T, FREE), stretch.lever_m, RULES.observable)
             through = stretch.looks_through(whole.walls, end.T_world_camera)
             in_free = whole.in_free(stretch.points_from(end.T_world_camera))
             found.append(FoundPose(end, through, end.equations.fit - through - in_free, in_free))
@@ -225,7 +229,7 @@ def locate_stretch(
         places = aligned(grid, 1, poses[: RULES.whole_places])
         poses = [place.end.T_world_camera for place in places]
     # 3. What the best is worth, and whether any other is worth nearly as much.
-    return _judged(stretch, places, lever_m) if places else LocatedRecording(None, "it fits nowhere")
+    return _judged(stretch, places) if places else LocatedRecording(None, "it fits nowhere")
 
 
 def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
@@ -234,10 +238,11 @@ def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
     # An upright scan amid the cameras: any heading will do.
     T_first[:3, :3] = level_frame(up_map).T @ level_frame(stretch.up / np.linalg.norm(stretch.up))
     T_first[:3, 3] = np.median(whole.cameras_m, axis=0)
+    aside_m = max(RULES.whole_aside_m, stretch.lever_m)
 
     def near_cameras(cell_m: float, R_level_world: NDArray[np.float64]) -> NDArray[np.int64]:
         cells = np.rint((whole.cameras_m - T_first[:3, 3]) @ R_level_world.T / cell_m).astype(np.int64)
-        aside, rise = (int(np.ceil(m / cell_m)) for m in (RULES.whole_aside_m, RULES.whole_rise_m))
+        aside, rise = (int(np.ceil(m / cell_m)) for m in (aside_m, RULES.whole_rise_m))
         reach = np.array([aside, aside, rise])
         lowest = cells.min(axis=0) - reach
         near = np.zeros(cells.max(axis=0) + reach + 1 - lowest, bool)
@@ -251,7 +256,7 @@ def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
     return best_poses(stretch.points, whole.planes, T_first, up_map, near_cameras, number)
 
 
-def _judged(stretch: Stretch, places: Sequence[FoundPose], lever_m: float) -> LocatedRecording:
+def _judged(stretch: Stretch, places: Sequence[FoundPose]) -> LocatedRecording:
     """Verdict on the best of several places."""
     best, *others = places
     equations, T_scan_recording = best.end.equations, inverse(stretch.T_recording_scan)
@@ -276,7 +281,7 @@ def _judged(stretch: Stretch, places: Sequence[FoundPose], lever_m: float) -> Lo
         )
         return replace(seen, reason=reason, places=tuple(T_map_recording[:2]))
     certain = equations.worth * (SURFACE_SIGMA_M / RULES.whole_sigma_m) ** 2
-    information = certain * determined(equations.H, lever_m, RULES.observable)
+    information = certain * determined(equations.H, stretch.lever_m, RULES.observable)
     covariance = np.linalg.pinv(information).astype(np.float64)
     return replace(seen, T_map_recording=T_map_recording[0], covariance=covariance)
 

@@ -53,12 +53,13 @@ def around(count: int, radius_m: float = 0.5) -> list[Pose]:
     return [look_at(place, (4 * place[0], 4 * place[1], -0.3)) for place in places]
 
 
-def box_room(length: float, width: float, *more: Solid) -> Scene:
-    """An empty room around the origin, 2.4 m high."""
-    walls = [Solid("box", (side * (length / 2 + 0.1), 0, 0), (0.1, width, 1.4)) for side in (-1, 1)] + [
-        Solid("box", (0, side * (width / 2 + 0.1), 0), (length, 0.1, 1.4)) for side in (-1, 1)
+def box_room(length: float, width: float, *more: Solid, height: float = 2.4) -> Scene:
+    """An empty room around the origin."""
+    top = height / 2 + 0.1
+    walls = [Solid("box", (side * (length / 2 + 0.1), 0, 0), (0.1, width, top)) for side in (-1, 1)] + [
+        Solid("box", (0, side * (width / 2 + 0.1), 0), (length, 0.1, top)) for side in (-1, 1)
     ]
-    levels = [Solid("box", (0, 0, side * 1.3), (length, width, 0.1)) for side in (-1, 1)]
+    levels = [Solid("box", (0, 0, side * top), (length, width, 0.1)) for side in (-1, 1)]
     return Scene((*walls, *levels, *more), (0.0, 0.0, 1.0))
 
 
@@ -119,6 +120,19 @@ def test_an_empty_room_looks_alike_from_two_sides() -> None:
     found = located(m, frames, T_away)
     assert found.T_map_recording is not None, found.reason
     assert tangent_norms(found.T_map_recording @ T_away, np.eye(4))[1] < 0.03
+
+
+def test_in_a_hall_a_stretch_is_found_further_from_the_cameras() -> None:
+    """More than 5 m aside of all cameras of the map, which is searched as far as the stretch sees."""
+    corner, block = Solid("box", (7, 5, 0), (2.5, 2, 3)), Solid("box", (-1, -5, -2), (2, 1.5, 2))
+    hall, poses, shift = box_room(14.0, 11.0, corner, block, height=6.0), around(12), np.zeros((4, 4))
+    shift[:2, 3] = 3.2, 0.5
+    m = map_of(shot(hall, [T - shift for T in poses]))
+    frames, T_away = shot(hall, [T + 1.2 * shift for T in poses[::2]]), turned_away()
+    assert stretch_of(frames, T_away).lever_m > 4.8
+    found = located(m, frames, T_away)
+    assert found.T_map_recording is not None, found.reason
+    assert tangent_norms(found.T_map_recording @ T_away, np.eye(4))[1] < 0.05
 
 
 def test_a_wall_alone_is_too_little() -> None:
