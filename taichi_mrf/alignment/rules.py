@@ -183,6 +183,9 @@ class Rules:
     whole_frames: int = 10
     """Frames of a stretch of a recording that is searched for in a whole map."""
 
+    whole_fewest: int = 5
+    """Frames of which a stretch needs to be, at least: one view of a wall or of a corridor fits by chance."""
+
     whole_stretches: int = 6
     """Stretches of a recording that are searched for, at most, before it is refused."""
 

@@ -201,7 +201,9 @@ def locate_stretch(
 ) -> LocatedRecording:
     """The place of a stretch in a whole map, or a refusal. If it is thought to be at ``T_map_recording``
     (4, 4), it is looked for only near there."""
-    points = stretch.points
+    points, views = stretch.points, len(stretch.images)
+    if views < RULES.whole_fewest:
+        return LocatedRecording(None, f"too little seen: {views} views, and {RULES.whole_fewest} are needed")
     if len(points.points) < LEAST_POINTS or len(whole.planes.points_m) < LEAST_POINTS:
         return LocatedRecording(None, "too little seen: hardly any point lies on a smooth surface")
     # 1. Every heading at every place near the map's cameras.

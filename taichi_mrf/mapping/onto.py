@@ -139,7 +139,7 @@ def _image(m: MRFMap, frame: Frame) -> DepthImage:
 
 STANDS_S = 10.0
 """An endless recording whose view has not changed for so long, in seconds of its stamps, is searched for by
-what there is."""
+what there is, if that is enough."""
 
 
 def _posed(
@@ -167,7 +167,8 @@ def _posed(
                 if kept is not None:
                     kept[index] = frame
                     tell(_views(part))
-            stands = endless and bool(part) and frame.stamp - part[-1].stamp > STANDS_S
+            enough = endless and len(part) >= RULES.whole_fewest
+            stands = enough and frame.stamp - part[-1].stamp > STANDS_S
             if len(part) == RULES.whole_frames or stands:
                 break
         if part:

@@ -143,6 +143,15 @@ def test_a_wall_alone_is_too_little() -> None:
     assert found.reason.startswith(("too little seen", "two places look alike"))
 
 
+def test_a_few_views_are_too_little(yesterday: MRFMap) -> None:
+    """They fit, and so would a corridor's end."""
+    frames = [room_frames()[index] for index in TODAY[:5]]
+    assert located(yesterday, frames, turned_away()).T_map_recording is not None
+    assert (
+        located(yesterday, frames[:4], turned_away()).reason == "too little seen: 4 views, and 5 are needed"
+    )
+
+
 def test_images_without_smooth_surfaces_are_too_little(yesterday: MRFMap) -> None:
     blank = [Frame(np.zeros(CAMERA.shape, np.float32), np.eye(4), CAMERA, 0.0, "blank")] * 3
     assert located(yesterday, blank, np.eye(4)).reason.startswith("too little seen")

@@ -180,17 +180,19 @@ def test_frozen_keyframes_of_the_earlier_map_are_evidence_only(days: Days) -> No
     assert not any(keyframe.earlier for keyframe in shown(link.sent).keyframes.values())
 
 
-def test_a_tracked_camera_goes_on_from_where_it_was_located(days: Days) -> None:
+def test_a_tracked_recording_goes_on_from_where_it_was_located(days: Days, tmp_path: Path) -> None:
     link = FakeLink()
-    session = session_onto(days, link, track=True)
+    recording = write(tmp_path / "carried", carried(), away())
+    source, _ = open_source(str(recording), CONFIG, onto=days.map, track=True, **AT_ONCE)
+    session = Session(source, link, Policy(tmp_path / "out", leave_when_done=True))
     m = finished(session)
     result = session.state.result()
     assert result.track is not None
-    assert len(m.keyframes) > COUNT // 2
-    named = {frame.stamp: frame for frame in frames()[1::2]}
+    assert len(result.track.frames) == len(carried())
+    named = {round(frame.stamp, 3): frame for frame in carried()}
     for stamp, T in result.track.trajectory(m):
-        off = np.linalg.inv(named[stamp - later_s(session)].T_world_camera) @ T
-        assert np.linalg.norm(off[:3, 3]) < 0.05
+        off = np.linalg.inv(named[round(stamp - later_s(session), 3)].T_world_camera) @ T
+        assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
 
 
 def later_s(session: Session) -> float:
@@ -300,13 +302,19 @@ def test_a_robot_goes_on_in_the_map_once_it_is_located(
         assert off_m.min() < 0.05
 
 
-def test_a_robot_that_stands_still_is_located_by_what_it_sees(days: Days) -> None:
-    still = [replace(frames()[1], stamp=0.5 * i, name=f"{i}") for i in range(100)]
-    robot = sensor(still)
+def test_a_robot_that_stands_still_is_located_by_five_views(days: Days) -> None:
+    still = [replace(frames()[9], stamp=100 + 0.5 * i) for i in range(100)]
+    robot = sensor([*frames()[1:10:2], *still])
     placed = placed_in(load_map(days.map), "yesterday", robot)
-    assert robot.came < 40
-    assert placed.read(0).name == "2:0"
-    assert placed.read(1).name == f"2:{robot.came - 1}"  # the next that comes
+    assert 5 < robot.came < 40
+    assert len(placed.located.frames) == 5
+    assert placed.read(0).name == f"2:{frames()[1].name}"
+
+
+def test_a_robot_that_has_never_moved_is_not_located_by_one_view(days: Days) -> None:
+    still = [replace(frames()[1], stamp=0.5 * i) for i in range(100)]
+    with pytest.raises(DatasetError, match="no image comes any more"):
+        placed_in(load_map(days.map), "yesterday", sensor(still))
 
 
 @dataclass
