@@ -84,6 +84,19 @@ class Derived(Dataset):
         return self.source.frame_names
 
 
+def later(frame: Frame, by_s: float) -> Frame:
+    """A frame as if it had been taken so many seconds later, with the samples of its IMU."""
+    if by_s == 0:
+        return frame
+    gyro, acceleration = frame.gyro, frame.acceleration
+    return replace(
+        frame,
+        stamp=frame.stamp + by_s,
+        gyro=gyro and replace(gyro, stamps_s=gyro.stamps_s + by_s),
+        acceleration=acceleration and replace(acceleration, stamps_s=acceleration.stamps_s + by_s),
+    )
+
+
 @dataclass
 class Reposed(Derived):
     """The frames of ``source``, each (by index) at its pose of ``poses``, (4, 4) T_world_camera."""

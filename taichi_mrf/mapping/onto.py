@@ -19,7 +19,7 @@ from taichi_mrf.config.schema import Config, KeyframeConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.base import EndlessNames, StampedPoses
-from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.derived import Derived, later
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.geometry.up import up_vector
@@ -362,9 +362,8 @@ class Placed(Derived):
         self._next, kept = index + 1, index < len(self._first)
         frame = self._first[index] if kept else self.source.read(index + self._left_out)
         return replace(
-            frame,
+            later(frame, self.later_s),
             T_world_camera=self.T_map_recording @ frame.T_world_camera,
-            stamp=frame.stamp + self.later_s,
             name=f"{self.prefix}{frame.name}",
             origin_m=tuple(self.map_origin_m),
         )

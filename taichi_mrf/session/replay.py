@@ -7,10 +7,10 @@ frame that cannot be read, an UnreadableFrame is returned.
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.base import Arrivals
+from taichi_mrf.datasets.derived import later
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
@@ -141,7 +141,7 @@ class Replay:
             self.has_pace = not self._dataset.endless and math.isfinite(frame.stamp)
             if math.isfinite(frame.stamp):
                 self._note(frame.stamp)
-                frame = replace(frame, stamp=frame.stamp + self._later_s)
+                frame = later(frame, self._later_s)
         self.number, self._next = self._next, self._next + 1
         self._find_next()
         if isinstance(frame, UnreadableFrame) and frame.last:

@@ -19,6 +19,7 @@ from taichi_mrf.mapping.onto import Placed, locate, parameters_onto, placed_in
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -138,6 +139,19 @@ def test_frames_of_the_same_name_and_an_earlier_clock_get_others(saved: Path) ->
     assert third.frame_names[0] == "3:frame-000"
     later = placed_in(m, "yesterday", recorded(TODAY[-6:], name="other"))
     assert later.frame_names[0].startswith("other")
+
+
+def test_the_samples_of_an_imu_move_with_their_frame(saved: Path) -> None:
+    source = recorded(YESTERDAY, turned_away())
+    stamps_s, rows = np.array([-0.1, 0.0]), np.ones((2, 3))
+    gyro, acceleration = GyroSamples(stamps_s, rows), AccelerationSamples(stamps_s, rows, np.zeros(3))
+    source.frames = [replace(frame, gyro=gyro, acceleration=acceleration) for frame in source.frames]
+    placed = placed_in(tm.load_map(saved), "yesterday", source)
+    assert placed.later_s > 0
+    frame = placed.read(0)
+    for samples in (frame.gyro, frame.acceleration):
+        assert samples is not None
+        np.testing.assert_array_equal(samples.stamps_s, stamps_s + placed.later_s)
 
 
 def test_names_without_an_end_keep_their_prefix() -> None:
