@@ -26,7 +26,7 @@ from taichi_mrf.geometry.up import up_vector
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.intake import Added, Intake, Lost, Passed
 from taichi_mrf.mapping.selection import KeyframeSelector
-from taichi_mrf.methods.capabilities import can_refine_poses
+from taichi_mrf.methods.capabilities import can_freeze, can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
@@ -282,6 +282,13 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda 
         map_origin_m=np.asarray(m.config.volume.origin),
         kept=kept,
     )
+
+
+def freeze_all(m: OccupancyMap) -> None:
+    """Keep a map's keyframes as evidence only, if its method can."""
+    if can_freeze(m):
+        for id in list(m.keyframes):
+            m.freeze_keyframe(id)
 
 
 def free_prefix(m: OccupancyMap, names: Sequence[str] = ()) -> str:

@@ -20,9 +20,8 @@ from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance, mistakes
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.mapping.intake import hold_out_of
-from taichi_mrf.mapping.onto import Placed, placed_in
+from taichi_mrf.mapping.onto import Placed, freeze_all, placed_in
 from taichi_mrf.mapping.tracking import wants_color
-from taichi_mrf.methods.capabilities import can_freeze
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -239,7 +238,6 @@ def _earlier_map(loaded: list[OccupancyMap], path: Path, config: Config, frozen:
     """The saved map that a recording joins, at first the one that is ``loaded``; with ``frozen`` all its
     keyframes are."""
     m = loaded.pop() if loaded else load_map(path, config.volume.memory_limit_gb)
-    if frozen and can_freeze(m):
-        for id in list(m.keyframes):
-            m.freeze_keyframe(id)
+    if frozen:
+        freeze_all(m)
     return m

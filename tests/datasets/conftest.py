@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
+from heard import begun
 from inputs_bags import Bag, Kind, write_bag
 
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.wires import robot as wired
 
 
@@ -41,16 +41,6 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
         ) -> tuple[Any, Dataset, Path]:
             bag = write_bag(tmp_path, *parts, kind=kind)
             sender = stack.enter_context(robot(bag))
-
-            def send() -> None:
-                sender.wait_for(listen_to)
-                sender.send_next(first)
-
-            thread = Thread(target=send)
-            thread.start()
-            try:
-                return sender, open_dataset(sender.source + query, color=color), bag
-            finally:
-                thread.join()
+            return sender, begun(sender, first, query, listen_to, color), bag
 
         yield begin_one

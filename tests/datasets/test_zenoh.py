@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from heard import SECONDS, came, follow_bag, heard
+from heard import SECONDS, begun, came, follow_bag, heard
 from inputs_bags import (
     COUNT,
     IMU,
@@ -29,7 +29,7 @@ from inputs_bags import (
 )  # fmt: skip
 
 from taichi_mrf.cli.main import main
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.wires import rmw_zenoh
 from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.client import wait_until
@@ -168,21 +168,6 @@ def test_a_lost_connection_is_made_again_with_its_topics(walk: Robot, client: Ze
     walk.send_next(1000)
     wanted = [each for each in walk.messages if each[0] in ("/odom", "/tf_static")]
     assert len(heard(client, len(wanted))) == len(wanted)
-
-
-def begun(sender: Robot, first: int, query: str = "", listen_to: str = "/odom") -> Dataset:
-    """The dataset of a robot that has sent its first messages while it was listened to."""
-
-    def send() -> None:
-        sender.wait_for(listen_to)
-        sender.send_next(first)
-
-    thread = Thread(target=send)
-    thread.start()
-    try:
-        return open_dataset(sender.source + query, color=False)
-    finally:
-        thread.join()
 
 
 def metres(i: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,21 @@ def heard(client: Client, count: int) -> list[Raw]:
 
     assert wait_until(enough, SECONDS), f"{len(found)} of {count} messages"
     return found
+
+
+def begun(sender: Any, first: int, query: str = "", listen_to: str = "/odom", color: bool = False) -> Dataset:
+    """The dataset of a robot that has sent its first messages while it was listened to."""
+
+    def send() -> None:
+        sender.wait_for(listen_to)
+        sender.send_next(first)
+
+    thread = Thread(target=send)
+    thread.start()
+    try:
+        return open_dataset(sender.source + query, color=color)
+    finally:
+        thread.join()
 
 
 def whole(live: Dataset) -> stream.Robot:

@@ -14,9 +14,8 @@ from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.datasets.summary import note_unused_color
 from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
 from taichi_mrf.errors import ReadWrongError
-from taichi_mrf.mapping.onto import placed_in
+from taichi_mrf.mapping.onto import freeze_all, placed_in
 from taichi_mrf.mapping.tracking import wants_color
-from taichi_mrf.methods.capabilities import can_freeze
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.runs.files import CONFIG_FILE
@@ -45,9 +44,8 @@ def located_onto(task: MapTask, dataset: Dataset) -> tuple[Dataset, OccupancyMap
         return dataset, None
     m = load_map(options.onto, task.settings.volume.memory_limit_gb)
     dataset = placed_in(m, str(options.onto), dataset)
-    if options.frozen and can_freeze(m):
-        for id in list(m.keyframes):
-            m.freeze_keyframe(id)
+    if options.frozen:
+        freeze_all(m)
     return dataset, m
 
 
