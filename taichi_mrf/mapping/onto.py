@@ -136,11 +136,9 @@ def _stretches(
     """Stretches of a recording, from its beginning and from further on."""
     if not isinstance(frames, Dataset):
         return _posed(frames.__getitem__, len(frames))
-    if not frames.endless:
-        return _tracked(m, frames) if frames.tracked else _posed(frames.read, len(frames))
     if frames.tracked:
-        return _tracked_live(m, frames, kept, tell)
-    return _posed(frames.read, len(frames), kept, tell)
+        return _tracked_live(m, frames, kept, tell) if frames.endless else _tracked(m, frames)
+    return _posed(frames.read, len(frames), kept if frames.endless else None, tell)
 
 
 def _image(m: MRFMap, frame: Frame) -> DepthImage:
