@@ -38,7 +38,7 @@ from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.cli.bench import BenchRun, Measured
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.inference.sweep import TRACE_BYTES
-from taichi_mrf.kernels import quick_start
+from taichi_mrf.kernels import quick_launch, quick_start
 from taichi_mrf.system import compiler, runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
@@ -132,7 +132,7 @@ def count_launches(timed: bool = False) -> Iterator[Launches]:
     """Watch all launches while the block runs. ``timed`` waits for each kernel, so as to time it."""
     launches = Launches()
     kernels = compiler.kernel_class()
-    launch = kernels.launch_kernel
+    launch = kernels.__call__
     apart = runtime.active() != "cpu"
 
     def watched(self: Any, *arguments: Any, **named: Any) -> Any:
@@ -147,17 +147,17 @@ def count_launches(timed: bool = False) -> Iterator[Launches]:
         launches.seconds[self.func.__name__].append(time.perf_counter() - begin)
         return result
 
-    kernels.launch_kernel = watched
+    kernels.__call__ = watched
     try:
         yield launches
     finally:
-        kernels.launch_kernel = launch
+        kernels.__call__ = launch
 
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)
 WATCH = count_launches.__wrapped__.__code__.co_filename  # type: ignore[attr-defined]
-WITHIN_TAICHI = (WATCH, quick_start.__file__)
+WITHIN_TAICHI = (WATCH, quick_start.__file__, quick_launch.__file__)
 """Files of this package that Taichi calls, or that stand for it: their time is Taichi's."""
 IN_TAICHI = "Taichi: launches, arguments, copies"
 OTHERS = "Python: called by none of these"

@@ -32,12 +32,13 @@ import linecache
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from taichi_mrf.kernels import quick_start
+from taichi_mrf.kernels import quick_launch, quick_start
 from taichi_mrf.kernels.types import Template
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import ti
 
 quick_start.hasten()
+quick_launch.hasten()
 
 
 class Bundle:

@@ -150,6 +150,35 @@ def kernels_of(kernel: Any) -> dict[Any, Any]:
     return made
 
 
+def argument_kind(annotation: Any) -> str:
+    """The kind of a kernel's argument by its annotation: "template", "array" (of numbers), "vectors" (an
+    array of them), "reals" and "wholes" (a vector or matrix), "float", "int" (signed), or "" for any other.
+    Taichi alone."""
+    types, matrix = _inner("types.primitive_types"), _inner("lang.matrix").MatrixType
+    number = annotation.dtype if isinstance(annotation, matrix) else annotation
+    kind = ""
+    if isinstance(annotation, _inner("types.annotations").template):
+        kind = "template"
+    elif isinstance(annotation, _inner("types.ndarray_type").NdarrayType):
+        element = annotation.dtype
+        kind = ("vectors" if element.ndim == 1 else "") if isinstance(element, matrix) else "array"
+    elif id(number) in types.real_type_ids:
+        kind = "float" if number is annotation else "reals"
+    elif id(number) in (id(types.i32), id(types.i64)):
+        kind = "int" if number is annotation else "wholes"
+    return kind
+
+
+def run(compiled: Any, context: Any) -> None:
+    """Launch a kernel that was launched before, with the arguments of a context. Taichi alone."""
+    running = program()
+    try:
+        ready = running.compile_kernel(running.config(), running.get_device_caps(), compiled)
+        running.launch_kernel(ready, context)
+    except Exception as error:
+        raise _inner("lang.exception").handle_exception_from_cpp(error) from None
+
+
 def note_maker() -> tuple[Any, str]:
     """The class that notes where expressions stand in the source, and the name of its method for it."""
     compiler = COMPILERS[name()]
@@ -206,6 +235,7 @@ def _is_installed(package: str) -> bool:
     return found is not None and found.origin is not None  # a folder of that name has no origin
 
 
+@functools.cache
 def _inner(module: str) -> Any:
     return importlib.import_module(f"{name()}.{module}")
 
