@@ -117,10 +117,13 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         return Diagnosis((*carried, *apart), (_NO_READING,), given, contradicted=through)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
-    if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
+    likeliest = _with_likeliest_units(best, given, steps, sample)
+    nobodys = likeliest.factor != given.factor and not _unit_of_depth(steps / likeliest.factor)
+    # Such as depths so large that the camera stands still beside them, and a unit of depth that nobody has.
+    if nobodys or set(answered) & set(undecided):
         through = search.seen_through(given) > SEEN_THROUGH
         return Diagnosis((), (_NO_READING,), given, contradicted=through)
-    best = _with_likeliest_units(best, given, steps, sample)
+    best = likeliest
     found = (*_findings(given, best, steps, source), *carried)
     return Diagnosis(found, undecided, best, before, search.score(best), search)
 

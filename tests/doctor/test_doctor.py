@@ -439,6 +439,13 @@ def test_a_scale_that_few_use_is_found(room: list[Frame], steps: float, tmp_path
     assert finding.flag == f"--depth-scale {steps:g}"
 
 
+def test_a_unit_of_depth_that_nobody_has_is_not_named(room: list[Frame]) -> None:
+    """As 256 steps per metre at positions in centimetres are read: a fit by chance."""
+    found = diagnose(of_frames([replace(f, depth_m=f.depth_m * 2.56) for f in room]))
+    assert found.findings == ()
+    assert "none of the usual mistakes explains" in found.undecided[0]
+
+
 def test_a_command_that_does_not_mend_a_recording_is_not_named(
     room: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
