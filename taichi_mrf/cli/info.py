@@ -21,7 +21,7 @@ from taichi_mrf.config.schema import Arch, Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.entries import ROBOTS
-from taichi_mrf.datasets.recorded_noise import proposed_voxel_size
+from taichi_mrf.datasets.recorded_noise import note_of_filling, proposed_voxel_size, some_depths
 from taichi_mrf.datasets.registry import format_name, is_rendered, topics_in
 from taichi_mrf.datasets.ros.bag import BagSummary
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -91,7 +91,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
         runtime.init(options.arch)
     dataset = open_dataset(options.source, color=False, **options.reading.keywords())
     note_unused_color(dataset, options.source, options.reading)
-    notes = list(dataset.notes)
+    notes = [*dataset.notes, *note_of_filling(some_depths(dataset))]
     found = summarise(dataset)
     content = {field.name: getattr(found, field.name) for field in fields(found)}
     content["camera"] = _camera_facts(found.camera)
@@ -196,6 +196,7 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
         table.add_row(
             "depth", f"{low:.2f} to {high:.2f} m (1 to 99 %), in {found.measured:.0%} of the pixels"
         )
+        dataset.notes += note_of_filling(some_depths(dataset))
         size_cm = 100 * proposed_voxel_size(dataset)
         table.add_row("voxel size", f"{size_cm:g} cm fits; map takes it unless --voxel-size is given")
     if found.centre_range is not None:

@@ -43,10 +43,19 @@ def seen_again(
     points: NDArray[np.float64], T_second_first: Pose, second: NDArray[np.floating], camera: Projection
 ) -> SeenAgain:
     """Points (N, 3) of the first frame, in the frame of its camera, in a second depth image (H, W)."""
-    u, v, expected = camera.project(points @ T_second_first[:3, :3].T + T_second_first[:3, 3]).T
+    expected, rows, columns = pixels_of(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], camera)
+    return SeenAgain(expected, np.where(rows >= 0, second[rows, columns], 0.0), rows, columns)
+
+
+def pixels_of(
+    points: NDArray[np.float64], camera: Projection
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """The depths (N,) at which points (N, 3) of the camera frame are seen, NaN for those that are not, and
+    the rows and columns (N,), -1 for those."""
+    u, v, expected = camera.project(points).T
     inside = ~np.isnan(expected)
     rows, columns = (np.where(inside, np.rint(each), -1).astype(np.int64) for each in (v, u))
-    return SeenAgain(expected, np.where(inside, second[rows, columns], 0.0), rows, columns)
+    return expected, rows, columns
 
 
 USUAL = (1000.0, 5000.0, 4000.0, 6553.5, 10000.0, 256.0)
@@ -65,7 +74,7 @@ _LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 1.0
 _FARTHEST_NEIGHBOUR = 60
 _SAMPLES = 4000
 _LEAST_SAMPLES = 200
-_AGREES, _TIMES_BETTER = 0.03, 2.0
+_AGREES, _TIMES_BETTER, _TELLS = 0.03, 2.0, 0.001
 
 Image = NDArray[np.floating]
 
@@ -85,7 +94,7 @@ class Evidence:
             return None
         best = min(self.disagreement, key=self.disagreement.__getitem__)
         found, given = self.disagreement[best], self.disagreement[steps_per_metre]
-        return best if found <= _AGREES and given >= _TIMES_BETTER * found and given > _AGREES / 3 else None
+        return best if found <= _AGREES and given >= max(_TIMES_BETTER * found, _TELLS) else None
 
 
 def check_metres(depths: Sequence[Image], where: str) -> None:

@@ -106,7 +106,7 @@ def _with_reach(settings: Config, dataset: Dataset, depths_m: NDArray[np.float32
     given = sensor.max_depth != SensorConfig().max_depth
     if own is not None and not given:
         return _reaching(settings, dataset, own, "as far as the first scan reaches")
-    dataset.notes += _note_of_filling(depths_m)
+    dataset.notes += note_of_filling(depths_m)
     beyond = float((depths_m > sensor.max_depth).mean()) if depths_m.size else 0.0
     useful = _useful_depth(sensor, depths_m)
     if beyond <= MUCH or useful == sensor.max_depth:
@@ -141,7 +141,7 @@ def some_depths(dataset: Dataset) -> NDArray[np.float32]:
     return np.concatenate(depths)
 
 
-def _note_of_filling(depths_m: NDArray[np.float32]) -> list[str]:
+def note_of_filling(depths_m: NDArray[np.floating]) -> list[str]:
     """A note, if many measurements are one number that is far larger than all others."""
     if not depths_m.size:
         return []

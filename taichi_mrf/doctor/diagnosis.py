@@ -11,6 +11,7 @@ from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, 
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, out_of_sight
 from taichi_mrf.datasets.derived import Derived, Mended, Resampled
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
+from taichi_mrf.datasets.recorded_noise import note_of_filling
 from taichi_mrf.doctor.carried import carried_along
 from taichi_mrf.doctor.readings import UNITS, Reading
 from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
@@ -112,17 +113,26 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     carried = _carried(search, best)
     if best == given and before > _CONTRADICTING:
-        apart = [Finding(text) for text in (out_of_sight(dataset),) if text]
-        through = search.seen_through(given) > SEEN_THROUGH
-        return Diagnosis((*carried, *apart), (_NO_READING,), given, contradicted=through)
+        return _cannot_tell(dataset, search, carried)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
-    if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
-        through = search.seen_through(given) > SEEN_THROUGH
-        return Diagnosis((), (_NO_READING,), given, contradicted=through)
-    best = _with_likeliest_units(best, given, steps, sample)
+    likeliest = _with_likeliest_units(best, given, steps, sample)
+    nobodys = likeliest.factor != given.factor and not _unit_of_depth(steps / likeliest.factor)
+    # Such as depths so large that the camera stands still beside them, and a unit of depth that nobody has.
+    if nobodys or set(answered) & set(undecided):
+        return _cannot_tell(dataset, search, carried)
+    best = likeliest
     found = (*_findings(given, best, steps, source), *carried)
     return Diagnosis(found, undecided, best, before, search.score(best), search)
+
+
+def _cannot_tell(dataset: Dataset, search: Search, carried: list[Finding]) -> Diagnosis:
+    """No reading explains the frames; what no reading mends may be the cause."""
+    depths_m = np.concatenate([view.image[view.image > 0] for view in search.sample.views.values()])
+    causes = (out_of_sight(dataset), *note_of_filling(depths_m))
+    through = search.seen_through(search.given) > SEEN_THROUGH
+    findings = (*carried, *(Finding(text) for text in causes if text))
+    return Diagnosis(findings, (_NO_READING,), search.given, contradicted=through)
 
 
 def mistakes(dataset: Dataset) -> list[str]:

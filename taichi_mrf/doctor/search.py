@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.conventions import AXES, POSE_UNITS, TURNS
-from taichi_mrf.datasets.depth_scale import SeenAgain, seen_again
+from taichi_mrf.datasets.depth_scale import SeenAgain, pixels_of, seen_again
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.turned import T_sensor_stored
 from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
-from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
+from taichi_mrf.doctor.views import REACH_S, Floats, Sample, Sphere, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -98,7 +98,7 @@ class Search:
     def differences(self, reading: Reading) -> Floats:
         """By how much the frames of each pair differ, 0 to 0.2; NaN where a pose is not known at the time."""
         if reading not in self._known:
-            self._known[reading] = np.fromiter(self._differences(reading), np.float64)
+            self._known[reading] = self._differences(reading)
         return self._known[reading]
 
     def moves(self, reading: Reading) -> Iterator[Pose | None]:
@@ -117,14 +117,24 @@ class Search:
             T = inverse(poses[b]) @ poses[a] if known[a] and known[b] else None
             yield T if T is None or not reading.turned else turn.T @ T @ turn
 
-    def _differences(self, reading: Reading) -> Iterator[float]:
+    def _differences(self, reading: Reading) -> Floats:
+        """What views of one camera see is projected at once: a search tries thousands of readings."""
         views, points = self.sample.views, self._points(reading)
-        for (first, second), T in zip(self.sample.pairs, self.moves(reading), strict=True):
+        looks: dict[PinholeCamera | Sphere, list[tuple[int, int, Floats, View]]] = {}
+        moves = zip(self.sample.pairs, self.moves(reading), strict=True)
+        for index, ((first, second), T) in enumerate(moves):
             if T is None:
-                yield float("nan")
-            else:
-                there = _difference(points[first], T, views[second], reading)
-                yield min(there, _difference(points[second], inverse(T), views[first], reading))
+                continue
+            for way, one, other, move in ((0, first, second, T), (1, second, first, inverse(T))):
+                moved = points[one] @ move[:3, :3].T + move[:3, 3]
+                looks.setdefault(views[other].camera, []).append((way, index, moved, views[other]))
+        found = np.full((2, len(self.sample.pairs)), np.nan)
+        for camera, seen in looks.items():
+            off = _off(camera, [(moved, view) for _, _, moved, view in seen], reading)
+            for (way, index, _, _), each in zip(seen, off, strict=True):
+                count = max(1, int(_EXPLAINING * len(each)))
+                found[way, index] = np.partition(each, count - 1)[:count].mean()
+        return found.min(axis=0)
 
     def _points(self, reading: Reading) -> dict[int, Floats]:
         """The points (N, 3) of each view in the camera frame."""
@@ -301,11 +311,21 @@ def seen_by(view: View, points: Floats, T_second_first: Pose, reading: Reading) 
     return SeenAgain(expected, seen.measured * reading.factor, seen.rows, seen.columns)
 
 
-def _difference(points: Floats, T_second_first: Pose, view: View, reading: Reading) -> float:
-    seen = seen_by(view, points, T_second_first, reading)
-    both = seen.measured > 0
-    expected, measured = seen.expected[both], seen.measured[both]
+def _off(
+    camera: PinholeCamera | Sphere, looks: Sequence[tuple[Floats, View]], reading: Reading
+) -> list[Floats]:
+    """By how much the depths of points (N, 3), in the frames of views that one camera took, differ from those
+    that the views measured, (N,) for each: 0 to 0.2."""
+    points = np.concatenate([each for each, _ in looks])
+    camera = reading.stored_camera(camera) if isinstance(camera, PinholeCamera) else camera
+    expected, rows, columns = pixels_of(points, camera)
+    if reading.along_ray and isinstance(camera, PinholeCamera):
+        expected = np.linalg.norm(points, axis=1)
+    ends = np.cumsum([len(each) for each, _ in looks])[:-1]
+    pixels = zip(np.split(rows, ends), np.split(columns, ends), looks, strict=True)
+    measured = np.concatenate([view.image[v, u] for v, u, (_, view) in pixels]) * reading.factor
+    both = (rows >= 0) & (measured > 0)
     off = np.full(len(points), _WORST)
+    expected, measured = expected[both], measured[both]
     off[both] = np.minimum(np.abs(expected - measured) / np.maximum(expected, measured), _WORST)
-    count = max(1, int(_EXPLAINING * len(off)))
-    return float(np.partition(off, count - 1)[:count].mean())
+    return np.split(off, ends)

@@ -32,7 +32,7 @@ REACH_S = 1.0
 
 _POSE_SPACING_S = 0.1
 _POSES_WITHIN_S = 7.0
-_SAMPLES = 1000
+_SAMPLES = 250
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,7 @@ def write_room(
 
 
 @pytest.mark.parametrize("layout", ["rows", "log"])
-@pytest.mark.parametrize("steps", [1000.0, 5000.0])
+@pytest.mark.parametrize("steps", [1000.0, 5000.0, 4000.0, 6553.5])
 def test_an_assumed_scale_is_replaced_by_the_one_that_fits(tmp_path: Path, steps: float, layout: str) -> None:
     dataset = open_dataset(write_room(tmp_path / "mine", steps, layout=layout))
     assert dataset.camera == WIDE

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from console import carry_out
 from sliding_camera import CAMERA, SlidingCamera
 from stereo_rig import BASELINE, write_kitti
 
@@ -104,7 +105,7 @@ def test_outliers_are_dense_only_where_rays_are_short() -> None:
 
 @pytest.mark.parametrize("filling_m", [1e10, 65.535, 10.0])
 def test_a_number_for_what_was_not_seen_is_no_measurement_or_is_said(
-    filling_m: float, tmp_path: Path
+    filling_m: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     true_m = np.random.default_rng(0).uniform(1, 4, (4, 12, 16)).astype(np.float32)
     depth_m = true_m.copy()
@@ -120,6 +121,9 @@ def test_a_number_for_what_was_not_seen_is_no_measurement_or_is_said(
     told = [note for note in dataset.notes if "exactly 10 m" in note]
     assert len(told) == (filling_m == 10)
     assert not told or told[0].startswith("depth: 25% of the measurements")
+    for flags in ([], ["--json"]):
+        assert carry_out("info", tmp_path / "walk.npz", *flags) == 0
+        assert ("exactly 10 m" in capsys.readouterr().out) == (filling_m == 10)
 
 
 def test_no_range_is_sought_without_bound() -> None:

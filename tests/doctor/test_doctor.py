@@ -439,6 +439,22 @@ def test_a_scale_that_few_use_is_found(room: list[Frame], steps: float, tmp_path
     assert finding.flag == f"--depth-scale {steps:g}"
 
 
+def test_a_number_for_what_was_not_seen_is_named_where_frames_contradict(room: list[Frame]) -> None:
+    """Of each image a window that moves with the camera, as the sky does, is the sensor's longest range."""
+    window = np.zeros(room[0].depth_m.shape, bool)
+    window[10:, 20:] = True
+    found = diagnose(of_frames([replace(f, depth_m=np.where(window, 30, f.depth_m)) for f in room]))
+    assert found.contradicted
+    assert [each.text for each in found.findings if "exactly 30 m" in each.text]
+
+
+def test_a_unit_of_depth_that_nobody_has_is_not_named(room: list[Frame]) -> None:
+    """As 256 steps per metre at positions in centimetres are read: a fit by chance."""
+    found = diagnose(of_frames([replace(f, depth_m=f.depth_m * 2.56) for f in room]))
+    assert found.findings == ()
+    assert "none of the usual mistakes explains" in found.undecided[0]
+
+
 def test_a_command_that_does_not_mend_a_recording_is_not_named(
     room: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

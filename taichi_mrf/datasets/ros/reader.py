@@ -14,11 +14,13 @@ the unpackers of chunks up in tables, and take those of messages and files from 
 """
 
 import bz2
+import functools
 import importlib
 import os
 import re
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,9 +34,10 @@ from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.bounded import BoundedFile, stored_only
 from taichi_mrf.system.files import check_regular, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
+from taichi_mrf.system.packed import LARGEST_RATIO, UnpackedBytes
 
-_LEAST_BOUND, _LARGEST_RATIO = 1 << 26, 1000
-"""Chunks are a few megabytes, and one large image at most; images of a single value pack a thousandfold."""
+_LEAST_BOUND = 1 << 26
+"""Chunks are a few megabytes, and one large image at most."""
 
 
 def bound_unpacking() -> None:
@@ -44,9 +47,13 @@ def bound_unpacking() -> None:
         "lz4": importlib.import_module("lz4.frame").LZ4FrameDecompressor,
         "zstd": _zstd().ZstdDecompressor,
     }
-    ros1 = importlib.import_module("rosbags.rosbag1.reader").decompressors
-    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap").DECOMPRESSORS
-    for table in (ros1, mcap):
+    ros1 = importlib.import_module("rosbags.rosbag1.reader")
+    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    ros1.Reader.open = _sum_first(ros1.Reader.open, _held_to_sizes)
+    mcap.McapReader._open = _sum_first(
+        mcap.McapReader._open, lambda reader: [chunk.uncompressed_size for chunk in reader.chunks]
+    )
+    for table in (ros1.decompressors, mcap.DECOMPRESSORS):
         for name in set(table) & set(unpackers):
             table[name] = _bounded(unpackers[name], "chunk")
     vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"] = SimpleNamespace(
@@ -59,8 +66,8 @@ def bound_unpacking() -> None:
 
 def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:
     def unpack(packed: bytes, claimed: int | None = None) -> bytes:
-        """``claimed`` is the size that MCAP's reader expects; that of ROS 1 passes none."""
-        most = max(_LEAST_BOUND, _LARGEST_RATIO * len(packed))
+        """``claimed`` is the size of a chunk by its header; a message has none."""
+        most = max(_LEAST_BOUND, LARGEST_RATIO * len(packed))
         unpacker = make()
         found = unpacker.decompress(packed, most + 1 if claimed is None else min(most, claimed) + 1)
         if len(found) > most or (claimed is not None and (claimed > most or len(found) > claimed)):
@@ -70,6 +77,35 @@ def _bounded(make: Callable[[], Any], what: str) -> Callable[..., bytes]:
         return found
 
     return unpack
+
+
+def _sum_first(opens: Callable[[Any], None], sizes: Callable[[Any], Iterable[int]]) -> Callable[[Any], None]:
+    """A function that opens a reader and sums up what its chunks claim to unpack to, before one is: MCAP's
+    reader holds all at once that overlap in time, and an index may list one chunk a thousand times."""
+    opens = getattr(opens, "__wrapped__", opens)
+
+    @functools.wraps(opens)
+    def open_bounded(reader: Any) -> None:
+        opens(reader)
+        with ExitStack() as unless_bounded:
+            unless_bounded.callback(reader.close)
+            UnpackedBytes(reader.bio.seek(0, os.SEEK_END)).count("", sum(sizes(reader)))
+            unless_bounded.pop_all()
+
+    return open_bounded
+
+
+def _held_to_sizes(reader: Any) -> Iterator[int]:
+    """The sizes of a ROS 1 bag's chunks by their headers, which rosbags passes over; the unpackers keep to
+    them."""
+    ros1 = importlib.import_module("rosbags.rosbag1.reader")
+    for place, chunk in reader.chunks.items():
+        reader.bio.seek(place)
+        size = ros1.Header.read(reader.bio).get_uint32("size")
+        if chunk.decompressor is not ros1.decompressors["none"]:
+            unpack = functools.partial(chunk.decompressor, claimed=size)
+            reader.chunks[place] = chunk._replace(decompressor=unpack)
+        yield size
 
 
 def _zstd() -> Any:
@@ -304,6 +340,8 @@ def _unreadable(problem: str) -> str:
         return "is not a bag, despite its name; maybe a git-lfs pointer, or a failed download"
     if "empty" in problem:
         return "is an empty file"
+    if "too much for a file" in problem:
+        return f"{problem}; if you trust it, unpack it by 'rosbag decompress' or 'mcap decompress'"
     return (
         f"cannot be read as a bag, it is damaged or cut short: {problem}; 'rosbag reindex', 'ros2 bag "
         "reindex' or 'mcap recover' may mend a recording that was not closed"
