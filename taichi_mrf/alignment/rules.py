@@ -217,6 +217,9 @@ class Rules:
     whole_scan_through: float = 0.03
     """That share for the scans of a sensor that sees around, whose sightlines are coarser."""
 
+    whole_voxels_through: float = 0.03
+    """That share for a camera in a map of which only voxels are left."""
+
     whole_in_free: float = 0.08
     """Share of the images' points that may lie where the map is free, there: things that were moved, and a
     stereo camera's errors."""

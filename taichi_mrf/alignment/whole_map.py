@@ -26,11 +26,15 @@ from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.seen_through import Sightlines, looked_through
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
-from taichi_mrf.alignment.surfels import Planes, Surfels
+from taichi_mrf.alignment.surfels import Planes, Surfels, surfels_of
 from taichi_mrf.alignment.wide_search import best_poses, level_frame, upright
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
+from taichi_mrf.geometry.up import up_vector
 from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.queries.box import map_extent
+from taichi_mrf.queries.points import FREE as FREE_SPACE
+from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import sees_around
 
 UNKNOWN = np.full((6, 6), np.inf)
@@ -77,7 +81,7 @@ class LocatedRecording:
         if self.T_map_recording is None:
             return self.reason
         sigma_m, degrees = 100 * self.sigma_m, np.degrees(self.sigma_rad)
-        return f"{sigma_m:.0f} cm, {degrees:.1f} degrees, {100 * self.agreement:.0f}% of what is seen agrees"
+        return f"{sigma_m:.0f} cm, {degrees:.1f} degrees, {self.agreement:.0%} of what is seen agrees"
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, lengths in metres."""
@@ -99,13 +103,14 @@ class WholeMap:
     """What a map shows of its world: its ``surface``, the ``walls`` that several of its keyframes have
     measured, which nothing can look through, the places ``cameras_m`` (N, 3) of its keyframes, and ``up``
     (3,), upwards in its world to 45 degrees. ``is_free`` tells of points (N, 3), in metres, which lie in free
-    space, (N,)."""
+    space, (N,). ``most_through`` is the share of the walls that a camera's images may look through."""
 
     surface: Surfels
     walls: Planes
     cameras_m: NDArray[np.float64]
     up: NDArray[np.float64]
     is_free: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+    most_through: float = RULES.whole_through
 
     @cached_property
     def planes(self) -> Planes:
@@ -129,6 +134,39 @@ class WholeMap:
         for step in reach_m * np.concatenate([np.eye(3), -np.eye(3)]):
             free[free] = self.is_free(points_m[free] + step)
         return float(free.mean())
+
+
+def map_of_voxels(m: VoxelMap) -> WholeMap:
+    """What the voxels of a map show whose keyframes' images are gone: as its surface the occupied ones beside
+    free space, all of which are walls, with the direction of that space for a normal; as places of cameras
+    whatever is free."""
+    marginals, voxel_m, up = m.marginals, m.voxel_size, m.up
+    assert up is not None
+
+    def is_free(points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return marginals.state(points_m) == FREE_SPACE
+
+    centres_m, _ = m.voxels()
+    open_to = np.zeros(centres_m.shape)
+    for step in np.argwhere(np.ones((5, 5, 5))) - 2:
+        if 0 < step @ step <= 5:
+            open_to[is_free(centres_m + voxel_m * step)] += step / np.linalg.norm(step)
+    lengths = np.linalg.norm(open_to, axis=1)
+    beside = lengths > 1
+    points = OrientedPoints(
+        centres_m[beside].astype(np.float32),
+        (open_to[beside] / lengths[beside, None]).astype(np.float32),
+        np.full(beside.sum(), voxel_m / 4, np.float32),
+        np.zeros((beside.sum(), 2), np.int32),
+    )
+    surface = surfels_of(points, np.eye(4), 2 * voxel_m)
+    lower_m, upper_m = map_extent(m)
+    number = np.ceil((upper_m - lower_m) / RULES.grid_widest_m).astype(int)
+    places_m = lower_m + RULES.grid_widest_m * np.argwhere(np.ones(number))
+    walls = walls_of(surface, [surface, surface])
+    return WholeMap(
+        surface, walls, places_m[is_free(places_m)], up_vector(up), is_free, RULES.whole_voxels_through
+    )
 
 
 def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
@@ -231,7 +269,7 @@ def locate_stretch(
         places = aligned(grid, 1, poses[: RULES.whole_places])
         poses = [place.end.T_world_camera for place in places]
     # 3. What the best is worth, and whether any other is worth nearly as much.
-    return _judged(stretch, places) if places else LocatedRecording(None, "it fits nowhere")
+    return _judged(stretch, whole, places) if places else LocatedRecording(None, "it fits nowhere")
 
 
 def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
@@ -258,7 +296,7 @@ def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
     return best_poses(stretch.points, whole.planes, T_first, up_map, near_cameras, number)
 
 
-def _judged(stretch: Stretch, places: Sequence[FoundPose]) -> LocatedRecording:
+def _judged(stretch: Stretch, whole: WholeMap, places: Sequence[FoundPose]) -> LocatedRecording:
     """Verdict on the best of several places."""
     best, *others = places
     equations, T_scan_recording = best.end.equations, inverse(stretch.T_recording_scan)
@@ -269,7 +307,8 @@ def _judged(stretch: Stretch, places: Sequence[FoundPose]) -> LocatedRecording:
         through=best.through,
         in_free=best.in_free,
     )
-    reason = _objection(seen, best, stretch.around)
+    most = RULES.whole_scan_through if stretch.around else whole.most_through
+    reason = _objection(seen, best, most, RULES.whole_scan_in_free if stretch.around else RULES.whole_in_free)
     if reason:
         return replace(seen, reason=reason)
     alike = [place for place in others if place.worth > best.worth - RULES.whole_clearly]
@@ -288,23 +327,18 @@ def _judged(stretch: Stretch, places: Sequence[FoundPose]) -> LocatedRecording:
     return replace(seen, T_map_recording=T_map_recording[0], covariance=covariance)
 
 
-def _objection(seen: LocatedRecording, best: FoundPose, around: bool) -> str:
-    """Reason to doubt the place that fits best, with what is ``seen`` there; empty if there is none."""
-    fit = best.end.equations.fit
+def _objection(seen: LocatedRecording, best: FoundPose, through: float, in_free: float) -> str:
+    """Reason to doubt the place that fits best, with what is ``seen`` there and at most may be; empty if
+    there is none."""
+    fit, where = best.end.equations.fit, "another place: where it fits best,"
     if fit < RULES.least_fit:
-        return (
-            f"another place, or too little of it seen: {100 * fit:.0f}% of what is seen fits where most does"
-        )
+        return f"another place, or too little of it seen: {fit:.0%} of what is seen fits where most does"
     if seen.agreement < RULES.whole_agreement:
-        return f"another place: where it fits best, {100 * seen.agreement:.0f}% of what is seen agrees"
-    most = RULES.whole_scan_through if around else RULES.whole_through
-    if seen.through > most:
-        share = 100 * seen.through
-        return f"another place: where it fits best, it would look through {share:.0f}% of what is mapped"
-    most = RULES.whole_scan_in_free if around else RULES.whole_in_free
-    if seen.in_free > most:
-        share = 100 * seen.in_free
-        return f"another place: where it fits best, {share:.0f}% of what is seen lies where the map is free"
+        return f"{where} {seen.agreement:.0%} of what is seen agrees"
+    if seen.through > through:
+        return f"{where} it would look through {seen.through:.0%} of what is mapped"
+    if seen.in_free > in_free:
+        return f"{where} {seen.in_free:.0%} of what is seen lies where the map is free"
     if best.end.directions < 6:
         return f"too little seen: it determines {best.end.directions} of the six directions of its place"
     return ""

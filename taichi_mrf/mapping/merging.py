@@ -51,10 +51,10 @@ class _Node:
 
 
 def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
-    """Merge maps of one place; the first gives the world and the parameters. ``names`` are for messages.
+    """Merge maps of one place into the first, which may have frozen keyframes. ``names`` are for messages.
 
-    Raises ConfigError for fewer than two maps, for one whose keyframes cannot be aligned or are frozen, and
-    DatasetError for one that is found in no other.
+    Raises ConfigError for fewer than two maps, for one whose keyframes cannot be aligned, for a later one
+    whose keyframes are frozen, and DatasetError for one that is found in no other.
     """
     called = list(names) or [f"map {number}" for number in range(1, len(maps) + 1)]
     parts = _checked(maps, called)
@@ -74,11 +74,11 @@ def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
     solution = solve_pose_graph(placed | worlds, [*_shapes(nodes), *loops], fixed)
     trust = solution.trust[len(nodes) :]
     # All keyframes in one map.
-    m = MRFMap.from_config(parts[0].config, nodes[0].keyframe.camera)
+    m = parts[0]
     for number, part in enumerate(parts):
         prefix = free_prefix(m, [keyframe.name for keyframe in part.keyframes.values()])
         for n, node in enumerate(nodes):
-            if node.number == number:
+            if node.number == number > 0:
                 _add(m, part, node.keyframe, as_pose(solution.poses[n]), prefix)
     m.infer()
     moved_m = max(tangent_norms(placed[n], solution.poses[n])[1] for n in range(len(nodes)))
@@ -107,13 +107,16 @@ def lay_over(a: OccupancyMap, b: OccupancyMap) -> LocatedRecording | None:
 def _checked(maps: Sequence[OccupancyMap], names: Sequence[str]) -> list[MRFMap]:
     if len(maps) < 2:
         raise ConfigError("there is nothing to merge: pass two maps or more")
-    parts = []
+    parts: list[MRFMap] = []
     for m, name in zip(maps, names, strict=True):
         if not can_refine_poses(m):
             needed = methods_with("can_refine_poses")
             raise ConfigError(f"{name}: maps of the method {needed} can be merged, not {m.METHOD.name}")
-        if m.frozen:
-            raise ConfigError(f"{name}: {len(m.frozen)} keyframes are frozen, and have no images to merge")
+        if m.frozen and parts:
+            raise ConfigError(
+                f"{name}: frozen keyframes stay where they are: pass it as the first map, or map its "
+                "recording onto that"
+            )
         parts.append(m)
     return parts
 

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.rules import RULES
-from taichi_mrf.alignment.whole_map import LocatedRecording, Stretch, WholeMap, locate_stretch, walls_of
+from taichi_mrf.alignment.whole_map import (
+    LocatedRecording,
+    Stretch,
+    WholeMap,
+    locate_stretch,
+    map_of_voxels,
+    walls_of,
+)
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, KeyframeConfig
 from taichi_mrf.config.text import differences
@@ -78,7 +85,8 @@ def locate(
     kept: dict[int, Frame] | None = None,
     tell: Tell = lambda text: None,
 ) -> LocatedRecording:
-    """Find a recording in a map whose keyframes were taken in the same place at another time.
+    """Find a recording in a map whose keyframes were taken in the same place at another time. Where any of
+    them are frozen, it is searched for by what voxels show.
 
     ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
     If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. Of an
@@ -107,9 +115,12 @@ def locate(
 
 
 def whole_map(m: MRFMap) -> WholeMap:
-    """The surface that a map's keyframes have measured. Raises ConfigError if it has none."""
-    if m.up is None or not m.keyframes:
-        raise ConfigError("nothing can be found in a map without keyframes (frozen ones have no images)")
+    """The surface that a map's keyframes have measured, or, if any are frozen, that of its voxels. Raises
+    ConfigError for an empty map, and for one that does not know which way is up."""
+    if m.up is None:
+        raise ConfigError("nothing can be found in a map without keyframes that does not say which way is up")
+    if m.frozen:
+        return map_of_voxels(m)
     m.aligner.surface.update(m.keyframes)
     surface = m.aligner.surface.around(-EVERYWHERE, EVERYWHERE)
     walls = walls_of(surface, [m.aligner.surface.of([id]) for id in m.keyframes])
@@ -125,11 +136,9 @@ def _stretches(
     """Stretches of a recording, from its beginning and from further on."""
     if not isinstance(frames, Dataset):
         return _posed(frames.__getitem__, len(frames))
-    if not frames.endless:
-        return _tracked(m, frames) if frames.tracked else _posed(frames.read, len(frames))
     if frames.tracked:
-        return _tracked_live(m, frames, kept, tell)
-    return _posed(frames.read, len(frames), kept, tell)
+        return _tracked_live(m, frames, kept, tell) if frames.endless else _tracked(m, frames)
+    return _posed(frames.read, len(frames), kept if frames.endless else None, tell)
 
 
 def _image(m: MRFMap, frame: Frame) -> DepthImage:
@@ -264,7 +273,7 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda 
     if located.T_map_recording is None:
         raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
     notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]
-    newest_s = max(keyframe.stamp_s for keyframe in m.keyframes.values())
+    newest_s = max((keyframe.stamp_s for keyframe in m.keyframes.values()), default=-np.inf)
     first_s = next(iter(kept.values())).stamp if kept else float(dataset.stamps()[0])
     later_s = newest_s + NEXT_S - first_s if first_s < newest_s else 0.0
     if later_s:
@@ -295,6 +304,7 @@ def free_prefix(m: OccupancyMap, names: Sequence[str] = ()) -> str:
     """Prefix under which none of the ``names`` is that of a keyframe of a map, empty if none is; without
     names, one under which no keyframe of the map stands yet."""
     taken = {keyframe.name for keyframe in m.keyframes.values()}
+    taken |= set(m.frozen.values()) if can_freeze(m) else set()
     if names and taken.isdisjoint(names):
         return ""
     days = (f"{day}:" for day in itertools.count(2))

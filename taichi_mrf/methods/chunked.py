@@ -31,7 +31,7 @@ from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, join_bricks, sp
 _BYTES_PER_VOXEL = 9
 """Log-odds, states, and temporary arrays."""
 
-_SAME_LOG_ODDS = 1e-3
+SAME_LOG_ODDS = 1e-3
 """Free space without voxels is stored by its probability, which is float32."""
 
 
@@ -297,7 +297,7 @@ class ChunkedMap:
         first = np.array(chunk, np.int64) * CHUNK
         log_odds, places = split_bricks(block), np.indices((CHUNK,) * 3).reshape(3, -1).T
         # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.
-        away = np.abs(log_odds - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
+        away = np.abs(log_odds - self.header.seen_free_log_odds) < SAME_LOG_ODDS
         away |= log_odds == np.float32(self.header.prior_log_odds)
         near = np.flatnonzero(~away.all(axis=1)).astype(np.int32)
         field = self.distances((first - 1) * BRICK, (first + CHUNK + 1) * BRICK).field()

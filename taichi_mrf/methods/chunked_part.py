@@ -1,4 +1,4 @@
-"""A box of a chunked map, loaded into memory for all queries and exports."""
+"""A box of a chunked map, loaded into memory for all queries and exports; all of it, to be gone on with."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,13 +7,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config, SensorConfig
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, within_voxels, without_free
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
+from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.methods.capabilities import window_of
-from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked import SAME_LOG_ODDS, ChunkedMap
+from taichi_mrf.methods.map_file import MapHeader
+from taichi_mrf.methods.mrf.kept_rays import RayShare
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.storage import MapContents
 from taichi_mrf.methods.mrf.surfacing import LEAST
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.stored_distances import StoredDistances
@@ -255,7 +261,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)
         # Free and unknown space away from surfaces needs no voxels: occupancy() and state() read the chunks.
         known = ~np.isnan(values)
-        near = (known & (values != np.float32(m.header.seen_free_log_odds))).any(axis=1)
+        near = (np.abs(values - m.header.seen_free_log_odds) >= SAME_LOG_ODDS).any(axis=1)
         free.append(bricks[inside & ~near & known.any(axis=1)].astype(np.int32))
         taken = np.flatnonzero(inside & near)
         if len(taken):
@@ -266,3 +272,39 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         raise ConfigError("there is no surface in this box of the map")
     volume = replace(m.config.volume, min_evidence=m.header.min_evidence)
     return MapPart(m, lowest, after, View(pool, m.voxel_size, volume), np.concatenate(free))
+
+
+def config_in_memory(m: ChunkedMap) -> Config:
+    """The parameters of :func:`in_memory`. Raises MapFileError as it does."""
+    config, path = m.config, m.store.path
+    if not METHODS[config.method].can_freeze:
+        raise MapFileError(f"{path}: maps of the method {methods_with('can_freeze')} are gone on with")
+    if config.time.half_life_s > 0:
+        raise MapFileError(f"{path}: its world may change, and chunks hold no dates: pass a map.npz")
+    return replace(config, keep_surface=False, volume=replace(config.volume, window_m=0.0))
+
+
+def in_memory(m: ChunkedMap, memory_limit_gb: float | None = None) -> MRFMap:
+    """All of a map in chunks, by its marginals, as if all its keyframes had been frozen: without colours and
+    the measured surface. Raises MapFileError for a map whose evidence is not that of keyframes or has dates,
+    and as :func:`take_part`."""
+    config, part = config_in_memory(m), take_part(m.marginals)
+    pool = part.view.pool
+    bricks, belief = pool.bricks[pool.in_use], pool.read("belief", pool.in_use)
+    contents = MapContents(
+        header=MapHeader(config, part.noise, [], next_id=1, up=m.up),
+        bricks=bricks,
+        belief=belief,
+        evidence=belief,
+        total=None,
+        frozen_dated=None,
+        waiting=[],
+        frozen_owners=np.ones(len(bricks), np.int32),
+        frozen_crossed=np.concatenate([bricks, part.free_bricks]),
+        frozen={0: m.store.path.name},
+        parked=[],
+        colors=np.zeros((0, VOXELS, 4), np.uint8),
+        frozen_colors=ColorShare.nothing(),
+        kept=RayShare.nothing(),
+    )
+    return MRFMap.holding(contents, m.store.path, memory_limit_gb)

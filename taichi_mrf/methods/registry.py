@@ -4,8 +4,8 @@ from pathlib import Path
 
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
-from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.methods import chunked, chunked_part
 from taichi_mrf.methods.map_file import method_of, open_map_file
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera
@@ -20,9 +20,9 @@ def create_map(config: Config, camera: Camera) -> OccupancyMap:
 
 def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
     """A saved map of any method; ``memory_limit_gb`` overrides its memory limit. Raises MapFileError, or
-    CapacityError if there is not enough memory for it."""
+    CapacityError if there is not enough memory for it. One in chunks (.zarr) is as if all was frozen."""
     if is_folder(Path(path)) and Path(path).suffix == SUFFIX:
-        raise MapFileError(f"{path}: a map in chunks: open it with ChunkedMap.open")
+        return chunked_part.in_memory(chunked.ChunkedMap.open(path), memory_limit_gb)
     with open_map_file(Path(path)) as file:
         method = METHODS[method_of(file)]
     m: OccupancyMap = method.load_class().load(path, memory_limit_gb)

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from two_days import CAMERA, CONFIG, SIGMA_M, TODAY, YESTERDAY, room_frames, turned_away
 
-from taichi_mrf.alignment.whole_map import LocatedRecording, Stretch, locate_stretch, walls_of
+import taichi_mrf as tm
+from taichi_mrf.alignment.whole_map import (
+    LocatedRecording,
+    Stretch,
+    locate_stretch,
+    map_of_voxels,
+    walls_of,
+)
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.geometry.poses import Pose, inverse, look_at, tangent_norms
@@ -101,6 +108,29 @@ def test_another_room_is_refused(yesterday: MRFMap) -> None:
     assert found.T_map_recording is None
     assert found.reason.startswith("another place")
     assert np.isinf(found.covariance).all()
+
+
+def test_the_voxels_of_a_map_show_walls_and_where_cameras_may_be(yesterday: MRFMap) -> None:
+    """Where the marginals are, as in a map in chunks; a stretch is found there, another room is not."""
+    whole = map_of_voxels(yesterday)
+    planes = whole.surface.planes()
+    voxel_m = CONFIG.voxel_size
+    ahead = yesterday.marginals.state(planes.points_m + 2 * voxel_m * planes.normals)
+    assert (ahead == tm.FREE).mean() > 0.9
+    assert (yesterday.marginals.state(whole.cameras_m) == tm.FREE).all()
+    assert len(whole.walls.cells) == len(planes.cells)
+    for first in (0, 4, 9):
+        frames = [room_frames()[index] for index in TODAY[first : first + 6]]
+        T_away = turned_away(first)
+        found = locate_stretch(stretch_of(frames, T_away), whole)
+        assert found.T_map_recording is not None, found.reason
+        middle = frames[3].T_world_camera
+        turned_rad, shifted_m = tangent_norms(middle, found.T_map_recording @ T_away @ middle)
+        assert shifted_m < voxel_m
+        assert np.degrees(turned_rad) < 2
+    scene = box_room(5.0, 4.0, Solid("box", (1.2, 0.3, -0.9), (0.4, 0.6, 0.3)))
+    found = locate_stretch(stretch_of(shot(scene, around(8)), turned_away()), whole)
+    assert found.reason.startswith("another place")
 
 
 def test_an_empty_room_looks_alike_from_two_sides() -> None:

@@ -82,10 +82,25 @@ def test_frozen_needs_a_map_and_the_map_has_to_be_one(tmp_path: Path) -> None:
     assert_refused(taichi_mrf("map", TODAY, "--frozen", "--out", tmp_path / "out"), "add --onto MAP")
     done = taichi_mrf("map", TODAY, "--onto", tmp_path / "none.npz", "--out", tmp_path / "out")
     assert_refused(done, "none.npz")
-    chunks = tmp_path / "map.zarr"
-    done = taichi_mrf("map", TODAY, "--onto", chunks, "--out", tmp_path / "out")
-    assert_refused(done, "a map in chunks has no keyframes")
-    assert_refused(taichi_mrf("merge", chunks, chunks, "--out", tmp_path / "out.npz"), "a map in chunks")
+    done = taichi_mrf("map", TODAY, "--onto", tmp_path / "none.zarr", "--out", tmp_path / "out")
+    assert_refused(done, "none.zarr: there is no such folder")
+
+
+def test_a_map_in_chunks_is_gone_on_with_and_merged_into(yesterday: Path, tmp_path: Path) -> None:
+    chunks, today, both = tmp_path / "map.zarr", tmp_path / "today", tmp_path / "both.npz"
+    assert taichi_mrf("export", yesterday, "--to", chunks).returncode == 0
+    done = taichi_mrf("map", TODAY, "--onto", chunks, "--out", today, "--no-pictures")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((today / REPORT_FILE).read_text())
+    assert (report["keyframes"], report["frozen"], report["keyframes_before"]) == (18, 1, 1)
+    assert report["located"]["agreement"] > 0.8
+    done = taichi_mrf("map", TODAY, "--out", tmp_path / "alone", *FAST)
+    merged = taichi_mrf("merge", chunks, tmp_path / "alone" / MAP_FILE, "--out", both)
+    assert merged.returncode == 0, merged.stderr
+    m = tm.load_map(both)
+    assert (len(m.keyframes), dict(m.frozen)) == (18, {0: "map.zarr"})
+    refused = taichi_mrf("merge", tmp_path / "alone" / MAP_FILE, chunks, "--out", both)
+    assert_refused(refused, f"{chunks}: frozen keyframes stay where they are: pass it as the first map")
 
 
 def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:

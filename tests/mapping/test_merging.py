@@ -13,7 +13,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.merging import frame_of, lay_over, merge
-from taichi_mrf.mapping.onto import locate
+from taichi_mrf.mapping.onto import freeze_all, locate
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -111,8 +111,24 @@ def test_maps_that_cannot_be_merged_are_named() -> None:
     with pytest.raises(DatasetError, match=r"^b: not found in any other map: "):
         merge([a, elsewhere], ["a", "b"])
     a.freeze_keyframe(next(iter(a.keyframes)))
-    with pytest.raises(ConfigError, match=r"^a: 1 keyframes are frozen"):
-        merge([a, elsewhere], ["a", "b"])
+    with pytest.raises(ConfigError, match=r"^b: frozen keyframes stay where they are"):
+        merge([elsewhere, a], ["a", "b"])
+
+
+def test_a_map_whose_keyframes_are_frozen_takes_in_another() -> None:
+    a, b = made(YESTERDAY), made(TODAY, turned_away(), "today")
+    freeze_all(a)
+    a.infer()
+    centres, _ = a.voxels()
+    merged = merge([a, b])
+    assert merged.map is a
+    assert (len(a.keyframes), len(a.frozen)) == (COUNT, COUNT)
+    true = {f.name: f.T_world_camera for f in recorded(TODAY, name="today").frames}
+    for keyframe in a.keyframes.values():
+        turned_rad, shifted_m = tangent_norms(true[keyframe.name], keyframe.T_world_camera)
+        assert shifted_m < 0.08
+        assert np.degrees(turned_rad) < 2
+    assert (a.state(centres) == tm.OCCUPIED).mean() > 0.9
 
 
 def of_the_moving_room(seconds: range, T_world_room: Pose) -> MRFMap:

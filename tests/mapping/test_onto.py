@@ -15,7 +15,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import inverse, tangent_norms
 from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.onto import Placed, locate, parameters_onto, placed_in
+from taichi_mrf.mapping.onto import Placed, freeze_all, locate, parameters_onto, placed_in
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -94,6 +94,19 @@ def test_what_was_frozen_counts_as_evidence_only(saved: Path) -> None:
     assert (joined.map.state(centres) == tm.OCCUPIED).mean() > 0.95
     alone = map_sequence(recorded(TODAY[:4]), CONFIG).map
     assert (alone.state(centres) == tm.OCCUPIED).mean() < 0.7
+
+
+def test_a_map_whose_keyframes_are_all_frozen_is_found_by_its_voxels(saved: Path) -> None:
+    m = tm.load_map(saved)
+    freeze_all(m)
+    m.infer()
+    placed = placed_in(m, "yesterday", recorded(TODAY, turned_away()))
+    assert placed.later_s == 0
+    for index, frame in enumerate(recorded(TODAY).frames):
+        turned_rad, shifted_m = tangent_norms(frame.T_world_camera, placed.pose(index))
+        assert shifted_m < CONFIG.voxel_size
+        assert np.degrees(turned_rad) < 2
+    assert placed_in(m, "yesterday", recorded(YESTERDAY)).frame_names[0] == "2:frame-000"
 
 
 def test_todays_world_is_taken_to_the_maps(saved: Path) -> None:

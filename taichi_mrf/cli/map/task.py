@@ -17,7 +17,10 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
+from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.mapping.onto import parameters_onto
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import config_in_memory
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 from taichi_mrf.system import runtime
@@ -107,8 +110,11 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
 def settings_onto(onto: Path, asked: Config, default: Config) -> Config:
     """The parameters with which a recording goes on in a saved map (:func:`.parameters_onto`). Raises
     MapFileError, and ConfigError for others that are asked for."""
-    with open_map_file(onto) as file:
-        of_map = read_header(onto, file).config
+    if onto.suffix == SUFFIX:
+        of_map = config_in_memory(ChunkedMap.open(onto))
+    else:
+        with open_map_file(onto) as file:
+            of_map = read_header(onto, file).config
     return parameters_onto(of_map, asked, default, str(onto))
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from taichi_mrf.cli.options.shared import Reading, check_keyframes
+from taichi_mrf.cli.options.shared import Reading
 from taichi_mrf.config.schema import Arch
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.export.options import ExportOptions
@@ -133,7 +133,7 @@ class Merge:
         tyro.conf.Positional,
         tyro.conf.arg(metavar="MAP MAP...", help_behavior_hint="(required)"),
     ]
-    """The saved maps, with their keyframes: the map.npz of runs."""
+    """The saved maps, with their keyframes: the map.npz of runs. The first may be in chunks (map.zarr)."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="MAP")]
     """The map to write, an .npz file."""
@@ -143,8 +143,3 @@ class Merge:
 
     arch: Arch = "auto"
     """Backend to merge the maps on."""
-
-    def __post_init__(self) -> None:
-        if self.maps is not tyro.MISSING:
-            for path in self.maps:
-                check_keyframes(path)

@@ -116,16 +116,8 @@ class PoseFlags:
         )
 
 
-def check_keyframes(path: Path) -> None:
-    """Raise ConfigError for a map in chunks, which has no keyframes."""
-    if path.suffix == ".zarr":
-        raise ConfigError(f"{path}: a map in chunks has no keyframes to align: pass the map.npz of a run")
-
-
 def check_onto(onto: Path | None, frozen: bool, poses: PoseFlags) -> None:
     """Raise ConfigError for flags that do not go with ``--onto``, or without it."""
-    if onto is not None:
-        check_keyframes(onto)
     if frozen and onto is None:
         raise ConfigError("--frozen is for the keyframes of an earlier map: add --onto MAP")
     if onto is not None and (poses.refine_poses or poses.follow):

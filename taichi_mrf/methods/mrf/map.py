@@ -103,9 +103,8 @@ class MRFMap(BrickMap):
         self._next_id = 0
         self._parts = MapParts.of(self.config, self.prior, self.view, self._registry, self.LIMITS)
         self._keyframes = self._parts.keyframes
-        self.window: moving_window.MovingWindow | None = None
-        if config.volume.window_m > 0:
-            self.window = moving_window.MovingWindow(config.volume.window_m, self._parts)
+        window_m = config.volume.window_m
+        self.window = moving_window.MovingWindow(window_m, self._parts) if window_m > 0 else None
 
     @property
     def stale(self) -> bool:
@@ -385,9 +384,8 @@ class MRFMap(BrickMap):
         return self._parts.has_surface
 
     def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
-        """The signed distances that the keyframes measured, as of the last :meth:`infer`: computed once for
-        each state of the map, and read-only. ``between`` is called after each keyframe. Raises CapacityError
-        if there is not enough memory."""
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`: computed once a
+        state of the map, read-only. ``between`` is called after each keyframe. Raises CapacityError."""
         return surfacing.surface_field(self._parts, between)
 
     def surface(self, between: Callable[[], object] = lambda: None) -> "surfacing.FusedSurface":
@@ -451,8 +449,7 @@ class MRFMap(BrickMap):
         return self.decide()
 
     def decide(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
-        """Compute :attr:`decided`. ``between`` is called after each keyframe; an exception from it ends the
-        work. Raises CapacityError if there is not enough memory."""
+        """Compute :attr:`decided`, with ``between`` as :meth:`surface`. Raises CapacityError."""
         return reading.decide(self, self._parts, between)
 
     @property
@@ -488,13 +485,16 @@ class MRFMap(BrickMap):
     def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
         """Read a saved map, which can be queried at once and extended. ``memory_limit_gb`` overrides the
         saved limit. Raises MapFileError, or CapacityError if there is not enough memory."""
-        contents = storage.read_contents(Path(path))
-        header = contents.header
-        with map_file.naming(Path(path)):
-            m = cls.with_noise(header.limited_to(memory_limit_gb), header.noise)
-            slots = storage.place_contents(contents, m._parts)
+        return cls.holding(storage.read_contents(Path(path)), Path(path), memory_limit_gb)
+
+    @classmethod
+    def holding(cls, found: "storage.MapContents", path: Path, limit_gb: float | None = None) -> "MRFMap":
+        """The map with these contents of a file, as :meth:`load`."""
+        with map_file.naming(path):
+            m = cls.with_noise(found.header.limited_to(limit_gb), found.header.noise)
+            slots = storage.place_contents(found, m._parts)
             if m.window is not None:
-                m.window.resume(Path(path), contents.parked)
-        storage.show_contents(contents, m._parts, slots)
-        m._next_id, m._up, m.promise = header.next_id, header.up, header.promise
+                m.window.resume(path, found.parked)
+        storage.show_contents(found, m._parts, slots)
+        m._next_id, m._up, m.promise = found.header.next_id, found.header.up, found.header.promise
         return m
