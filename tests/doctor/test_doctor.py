@@ -435,7 +435,8 @@ def test_the_unit_of_depth_is_sought_at_the_poses_of_a_file_too(room: list[Frame
 
 @pytest.mark.parametrize("steps", [4000, 6553.5])
 def test_a_scale_that_few_use_is_found(room: list[Frame], steps: float, tmp_path: Path) -> None:
-    (finding,) = diagnose(open_dataset(write_numbered(tmp_path / "mine", room, steps=steps))).findings
+    folder = write_numbered(tmp_path / "mine", room, steps=steps)
+    (finding,) = diagnose(open_dataset(folder, depth_scale=1000)).findings
     assert finding.flag == f"--depth-scale {steps:g}"
 
 
