@@ -27,6 +27,7 @@ from taichi_mrf.datasets.lidar.clouds import (
     is_cloud,
     natural,
     number_of,
+    layout_notes,
     read_cloud,
     read_pcd_header,
 )
@@ -253,6 +254,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     if dropped and poses is not None:
         notes.append(f"{dropped} of {len(clouds)} scans dropped: {poses.name} has no pose for them")
     name = path.name if is_folder(path) else path.stem
+    notes += layout_notes(posed)
     return lidar_scans(name, scans, notes, dropped, options, takes_scale=True)
 
 
