@@ -30,8 +30,8 @@ def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
 
 
-def fill(bag: Bag, poses: tuple[str, ...], frame: str = "optical") -> None:
-    bag.camera_info("/camera/depth/camera_info", frame, CAMERA)
+def fill(bag: Bag, poses: tuple[str, ...], frame: str = "optical", camera: str = "optical") -> None:
+    bag.camera_info("/camera/depth/camera_info", camera, CAMERA)
     for i in range(11):
         depth = np.full(CAMERA.shape, 1000 + 100 * i, np.uint16)
         bag.image("/camera/depth/image_raw", 0.5 * i, frame, depth, "16UC1")
@@ -86,12 +86,21 @@ def test_info_of_a_bag_whose_images_are_of_no_known_frame_suggests_to_name_it(
     tmp_path: Path, frame: str, poses: tuple[str, ...], query: str
 ) -> None:
     with writing(tmp_path / "walk", "mcap") as bag:
-        fill(bag, poses, frame)
+        fill(bag, poses, frame, frame)
     status, out, errors = said("info", tmp_path / "walk")
     assert (status, errors) == (2, "")
     commands = [shlex.split(line) for line in out.splitlines() if line.startswith("taichi-mrf map")]
     assert commands[0][2] == f"{tmp_path / 'walk'}{query}"
     assert len(open_dataset(commands[0][2].replace("FRAME", "optical"))) == 11
+
+
+def test_info_of_a_bag_does_not_suggest_what_it_refuses(tmp_path: Path) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        fill(bag, (), camera="rear")
+    status, out, errors = said("info", tmp_path / "walk")
+    assert (status, errors) == (2, "")
+    assert "It cannot be mapped like this" in out
+    assert f"taichi-mrf map {tmp_path / 'walk'} --out" not in out
 
 
 def test_info_of_bags_that_need_more(tmp_path: Path) -> None:

@@ -25,9 +25,9 @@ from taichi_mrf.datasets.hints import unread_poses
 from taichi_mrf.datasets.lidar.clouds import (
     READERS,
     is_cloud,
+    layout_notes,
     natural,
     number_of,
-    layout_notes,
     read_cloud,
     read_pcd_header,
 )
