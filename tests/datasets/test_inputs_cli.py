@@ -172,7 +172,7 @@ def test_info_of_the_room(one_backend: str) -> None:
     status, out, errors = said("info", "synthetic:room?frames=3&width=40&height=30", "--arch", one_backend)
     assert (status, errors) == (0, "")
     assert re.search(r"format +│ +synthetic:room", out)
-    assert re.search(r"way +│ +x -?\d+\.\d\d to", out)
+    assert re.search(r"camera path +│ +x -?\d+\.\d\d to", out)
 
 
 @pytest.mark.parametrize(

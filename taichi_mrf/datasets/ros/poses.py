@@ -150,7 +150,7 @@ def find_poses(
             )
         others = [name for name in topics_of(reader, *messages.POSES) if _is_apart(name, tree)]
         if others:
-            problem += f". Poses of other robots: ?pose={' or ?pose='.join(others)}"
+            problem += f". Those of other robots: ?pose={' or ?pose='.join(others)}"
         raise DatasetError(problem)
     if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
         return _from_tree(reader, tree, optical, choice)
