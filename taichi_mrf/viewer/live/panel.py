@@ -60,10 +60,11 @@ class Dragged(Event):
 RUN_BUTTONS = ("Play", "Pause", "Step", "Reset")
 HISTORY_BUTTONS = ("Undo", "Redo")
 COMMANDS = {
+    "Return to the opening view": ("Home", "H", None),
     "Look from the top": ("Top", "1", None),
     "Look from the front": ("Front", "2", None),
     "Look from the side": ("Side", "3", None),
-    "Fit the whole map into the window": ("Fit", "0", None),
+    "Fit what is seen into the window": ("Fit", "0", None),
     "Follow the camera, or stop following": ("Follow", "F", None),
     "Undo the last edit": ("Undo", "Z", "cmd/ctrl"),
     "Redo the edit": ("Redo", "Z", "cmd/ctrl+shift"),
@@ -111,9 +112,10 @@ class Panel(BasePanel):
         self.add_counts()
         self.add_buttons(
             "View",
-            ("Top", "Front", "Side", "Fit"),
-            "Keys 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
-            "with Shift held, to see which keyframes say what is there, and how large it is.",
+            ("Home", "Top", "Front", "Side", "Fit"),
+            "Keys H, 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Home is the opening view. "
+            "Click into the map, or drag with Shift held, to see which keyframes say what is there, and how "
+            "large it is.",
         )
         self.view_options.add("follow")
         for label, command in COMMANDS.items():
