@@ -186,6 +186,8 @@ class BasePage(Generic[P]):
         self.show_counts()
         self._offer_cuts()
         with_baseline = bool(self.map.layers["baseline"].store.chunks)
+        shaded = with_baseline or self.options.shows != "points"
+        self.panel.show_used(with_baseline or (shaded and not self.map.shows_surface), shaded)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline
             self.viewpoint.look_at_everything()
