@@ -89,9 +89,6 @@ _PLAN_PIXELS = 1200
 _PLAN_SIZE_IN = 10.0
 _SURFACE = "the measured surface"
 
-_STRAY = 0.01
-"""Share of the map that may lie beyond each edge of the plan: what a lidar saw through a door, say."""
-
 
 @dataclass(frozen=True)
 class DrawnMap:
@@ -122,7 +119,8 @@ def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
     R_level_world = level_rotation(room.up)
     level = (room.centres if surface is None else surface.vertices_m) @ R_level_world.T
     way = np.array([R_level_world @ T[:3, 3] for T in room.T_world_cameras]).reshape(-1, 3)
-    low, high = np.quantile(level, [_STRAY, 1 - _STRAY], axis=0)
+    # The farthest hundredth at each edge is left out: what a lidar saw through a door, say.
+    low, high = np.quantile(level, [0.01, 0.99], axis=0)
     if len(way):
         low[:2], high[:2] = np.minimum(low, way.min(axis=0))[:2], np.maximum(high, way.max(axis=0))[:2]
     margin = 0.03 * (high - low)[:2].max() + room.voxel_size

@@ -192,7 +192,7 @@ class Panel(BasePanel):
             ended = h.has_frames and not coming
             activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"
         self.show_activity(activity, status.share, not (status.paused or status.finished))
-        self._show_speed(status.speed if coming else None)
+        self._show_speed(status.speed)
         self._size.content = f"Map: at most about {max(status.memory_mb, 1):,.0f} MB, it is compressed."
         self._numbers.content = rows_html(
             {

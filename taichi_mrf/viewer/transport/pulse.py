@@ -111,9 +111,10 @@ style.textContent = `
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
   }
   html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }
-  #cut-off { position: fixed; inset: 0 0 auto; z-index: 100000; padding: 0.6em; text-align: center;
+  #cut-off { position: fixed; inset: 0 25em auto 0; z-index: 100000; padding: 0.6em; text-align: center;
     font: 600 16px sans-serif; color: #fff; background: #c92a2a; pointer-events: none; }
-  html:not([data-cut-off]) #cut-off { display: none; }`;
+  html:not([data-cut-off]) #cut-off { display: none; }
+  @media (max-width: 36em) { #cut-off { right: 0; } }`;
 document.head.append(style);
 const banner = document.createElement("div");
 banner.id = "cut-off";
