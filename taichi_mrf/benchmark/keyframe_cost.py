@@ -1,6 +1,6 @@
 """Cost of a new keyframe in a live map, stage by stage, in seconds of the clock and of the processors.
 
-On a machine that runs other programs too, wall-clock time is of little use; the processors' time, all threads
+On a machine that runs other programs too, wall-clock time is of little use; the CPU time, all threads
 of the process together, still does.
 """
 

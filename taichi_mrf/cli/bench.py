@@ -32,7 +32,7 @@ Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None
 
 
 RATIOS = {"cpu_ratio_alone": "a keyframe without re-inference", "cpu_ratio_whole": "a keyframe"}
-"""The figures that ``--gate`` compares, and their names: processors' time repeats better than the clock's."""
+"""The figures that ``--gate`` compares, and their names: CPU time repeats better than the clock's."""
 
 WORSE = 1.1
 """A ratio that has grown by more than this factor is worse."""
@@ -143,7 +143,7 @@ def _ratios_in(path: Path, options: Bench) -> dict[tuple[float, str], float]:
 def _worse(rows: Sequence[dict[str, Any]], allowed: dict[tuple[float, str], float]) -> list[str]:
     """A line for each ratio that is more than WORSE of what is allowed."""
     return [
-        f"{row['voxel_size']:g} m: {RATIOS[name]} takes {row[name]:.3f} of OctoMap's processor time, "
+        f"{row['voxel_size']:g} m: {RATIOS[name]} takes {row[name]:.3f} of OctoMap's CPU time, "
         f"{then:.3f} before"
         for row in rows
         for (size, name), then in allowed.items()
@@ -180,7 +180,7 @@ def bench_table(rows: Sequence[BenchRow], title: str) -> Table:
     line("  its mean, ms", lambda r: _ms(r.whole_mean))
     line("  ratio to OctoMap", lambda r: _ratio(r.ratio_whole))
     line("  target, at most", lambda r: target(r, 1))
-    line("processors' time: OctoMap, ms", lambda r: _cpu_ms(r.octomap))
+    line("CPU time: OctoMap, ms", lambda r: _cpu_ms(r.octomap))
     line("  without re-inference, ms", lambda r: _cpu_ms(r.alone))
     line("  whole cost, ms", lambda r: _cpu_ms(r.whole))
     line("one sweep, all inferred, ms", lambda r: _ms(r.full_sweep))

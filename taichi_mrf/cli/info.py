@@ -201,7 +201,7 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
         table.add_row("voxel size", f"{size_cm:g} cm fits; map takes it unless --voxel-size is given")
     if found.centre_range is not None:
         axes = (f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", *found.centre_range, strict=True))
-        table.add_row("way", f"{', '.join(axes)} m")
+        table.add_row("camera path", f"{', '.join(axes)} m")
     console.print(table)
     for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
         console.print_line(f"Note: {note}")

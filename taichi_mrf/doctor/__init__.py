@@ -1,4 +1,5 @@
 """Which usual mistake of conventions makes the frames of a recording contradict each other.
 
-``taichi-mrf doctor`` prints what :func:`~taichi_mrf.doctor.diagnosis.diagnose` finds.
+Begin with ``diagnosis.py``: ``taichi-mrf doctor`` prints what its ``diagnose`` finds, and ``map`` refuses a
+recording by it. ``readings.py`` lists the mistakes, ``search.py`` tries them on pairs of frames.
 """

@@ -1,4 +1,7 @@
 """How well a map explains what it has not seen: accuracy, ground truth, reliability, pictures.
 
+Begin with ``accuracy.py``, the paper's measures. ``held_out.py`` checks every run, ``free_space.py`` finds
+what levels of free space mean, ``pictures`` draws runs.
+
 Uses `mapping` and the packages below it.
 """

@@ -14,7 +14,7 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnRays, RayList
-from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
+from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32Array, IVec3, Struct, Template, Vec3
@@ -182,7 +182,7 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
     """Mark the bricks that each ray crosses."""
     for group in range(rays.group_number):
         middle, free = block_ray(rays.groups[group], sensor, view), _Mark(FAR)
-        apart = way_in_common(rays, group, middle, reach.min_depth, reach.max_depth)
+        apart = end_of_shared_path(rays, group, middle, reach.min_depth, reach.max_depth)
         begin, end = reach.min_depth, apart
         clip(middle, begin, end, marks.lower, marks.upper)
         walk_bricks(middle, begin, end, marks.shape, marks.kinds, False, _mark_brick, free, marks)

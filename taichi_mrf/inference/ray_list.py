@@ -7,7 +7,7 @@ has their mean depth, and their number as its weight. Pixels that do not agree, 
 surface, keep rays of their own.
 
 In front of all surfaces rays side by side tell voxels the same, that they are free, and there one for each
-voxel is enough. Rays therefore form groups, larger blocks of pixels, which have one way in common up to where
+voxel is enough. Rays therefore form groups, larger blocks of pixels, which have one shared path up to where
 the first of their rays may meet its surface.
 """
 
@@ -40,11 +40,11 @@ AGREE_SIGMAS = 2.0
 """Measurements agree if they differ by no more than either of these."""
 
 FREE_RAYS = 1.0
-"""Ways in common that meet a voxel facing the camera, at least."""
+"""Shared paths that meet a voxel facing the camera, at least."""
 
 CLEAR_VOXELS = 2.0
 """Rays part this many voxels in front of the first of their surfaces: more than the longest way through one,
-so that no voxel is told by the way in common that it is free, in which a surface may be."""
+so that no voxel is told by the shared path that it is free, in which a surface may be."""
 
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many."""
@@ -81,7 +81,7 @@ def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
 
 
 @ti.func
-def way_in_common(rays: Template, group: I32, middle: Template, begin: F32, max_depth: F32) -> F32:
+def end_of_shared_path(rays: Template, group: I32, middle: Template, begin: F32, max_depth: F32) -> F32:
     """The depth up to which the rays of a group go along its ``middle`` ray from ``begin`` on. The voxel in
     which they part is one in which none of them can have met its surface."""
     apart = begin

@@ -9,7 +9,7 @@ is the probability that voxel i made the measurement: the ray reached it, it is 
 measurement. ``beyond`` is what lies past the end of the map, o the density of a measurement that no surface
 made.
 
-In front of all their surfaces the rays of a group have one way in common, as for messages (ray_list.py).
+In front of all their surfaces the rays of a group have one shared path, as for messages (ray_list.py).
 
 What is done with a ray's posterior is up to a :class:`RayVisitor`. There are three: the surface counts rays
 by the chance that they met one (surface_rays.py), colours go to the voxels that pixels saw (voxel_colors.py),
@@ -20,7 +20,7 @@ import math
 from dataclasses import dataclass
 
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
+from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import RayModel, log_pass
 from taichi_mrf.inference.sum_product import crossing, passage
 from taichi_mrf.inference.workers import Workers
@@ -148,9 +148,9 @@ def follow_rays(
         for turn in range(turns):
             group = workers.ray(worker, turn)
             if group < rays.group_number:
-                # In front of all surfaces of the group only the visibility changes, on the way in common.
+                # In front of all surfaces of the group only the visibility changes, on the shared path.
                 middle = block_ray(rays.groups[group], sensor, view)
-                apart = way_in_common(rays, group, middle, 0.0, model.max_depth)
+                apart = end_of_shared_path(rays, group, middle, 0.0, model.max_depth)
                 visibility = _visibility_at(apart, middle, space, model, swept)
                 for i in range(rays.first[group], rays.first[group + 1]):
                     if visitor.wants(rays, i) == 1:

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.ray_list import block_ray, listed_ray, way_in_common
+from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
@@ -115,8 +115,8 @@ def send_messages(
     """Follow the rays of a keyframe out and back, from ``begin_depth`` on, and sum up their messages to each
     voxel.
 
-    A worker follows one group of rays after the other: its way in common in front of all surfaces, from there
-    on each ray by itself out and back, and the way in common back. It writes each step into its own part of
+    A worker follows one group of rays after the other: its shared path in front of all surfaces, from there
+    on each ray by itself out and back, and the shared path back. It writes each step into its own part of
     the trace and reads it on the way back.
     """
     if ti.static(workers.block > 0):
@@ -134,12 +134,12 @@ def send_messages(
                 # In front of all surfaces of the group, forward: nu_j is 0, so only vis_i changes.
                 support, first_step = rays.support[group], worker * trace.longest
                 middle = block_ray(rays.groups[group], sensor, view)
-                apart = way_in_common(rays, group, middle, begin_depth, model.max_depth)
+                apart = end_of_shared_path(rays, group, middle, begin_depth, model.max_depth)
                 begin, end = begin_depth, apart
                 clip(middle, begin, end, space.lower, space.upper)
                 common, behind_all, pixels_all = ForwardPass(1.0, 0.0, 0), 0.0, 0.0
-                free_way = _FreeWay(model, swept, trace, first_step, middle.direction.norm())
-                walk_voxels(middle, begin, end, space, _trace_free, common, free_way)
+                shared = _SharedPath(model, swept, trace, first_step, middle.direction.norm())
+                walk_voxels(middle, begin, end, space, _trace_free, common, shared)
 
                 for i in range(rays.first[group], rays.first[group + 1]):
                     measured = rays.depth[i]
@@ -189,8 +189,8 @@ def send_messages(
 
 
 @dataclass(frozen=True)
-class _FreeWay(Bundle):
-    """The way in common of a group, which writes down its steps from ``first_step`` of the trace on."""
+class _SharedPath(Bundle):
+    """The shared path of a group, which writes down its steps from ``first_step`` of the trace on."""
 
     model: RayModel
     swept: SweptVoxels
@@ -201,7 +201,7 @@ class _FreeWay(Bundle):
 
 @ti.func
 def _trace_free(ahead: Template, way: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the way in common, in which no surface can have made a measurement."""
+    """One voxel of the shared path, in which no surface can have made a measurement."""
     length, log_free = passage(way, voxel, near, far)
     if ti.static(not way.model.segment_lengths):
         length = 1.0

@@ -1,4 +1,6 @@
-"""Common parts of Taichi kernels: argument types, arrays, strips of voxels, logarithms.
+"""What all kernels share: argument types, bundles of arguments, launches, arrays, logarithms.
+
+Begin with ``bundles.py``: how a kernel takes five arguments and not forty.
 
 Uses `system`.
 """

@@ -1,6 +1,7 @@
 """Mapping methods: MRFMap and its baselines, what they share, and how a map is created or loaded by method.
 
-Each method has a folder with its entry (`plug.py`), which `config/plugs.py` names.
+Begin with ``protocol.py``, the interface of all maps, and ``mrf/map.py``, which is ``tm.MRFMap``. Each method
+has a folder with its entry (``plug.py``), which ``config/plugs.py`` names.
 
 Uses `inference`, `alignment`, `queries`, `export` and the packages below them.
 """

@@ -113,7 +113,7 @@ def test_the_gate_closes_when_a_ratio_has_grown(tmp_path: Path) -> None:
     assert bench_command._worse(rows, allowed) == []
     slower = [{"voxel_size": 0.1, "cpu_ratio_alone": 0.21, "cpu_ratio_whole": 0.34}]
     (line,) = bench_command._worse(slower, allowed)
-    assert line == "0.1 m: a keyframe takes 0.340 of OctoMap's processor time, 0.300 before"
+    assert line == "0.1 m: a keyframe takes 0.340 of OctoMap's CPU time, 0.300 before"
     with pytest.raises(ConfigError, match=r"for voxels of 0\.05 0\.1 m"):
         bench_command._ratios_in(before, Bench(source=TINY, voxel_sizes=(0.05, 0.1)))
     with pytest.raises(ConfigError, match=r"was measured on .*room.*, not on kitchen"):

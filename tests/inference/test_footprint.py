@@ -188,7 +188,7 @@ def test_an_image_of_nothing_and_one_of_a_single_pixel(value: float) -> None:
         assert len(footprint.window.bricks_of(footprint.crossed)) == 0
 
 
-def test_rays_with_a_way_in_common_cross_the_bricks_on_it() -> None:
+def test_rays_with_a_shared_path_cross_the_bricks_on_it() -> None:
     """A fine image of a wall: single rays begin far from the camera, and groups of them bring the rest. The
     bricks are those of all pixels, but for some that few of these graze."""
     camera = PinholeCamera(width=160, height=120, fx=130, fy=130, cx=79.5, cy=59.5)

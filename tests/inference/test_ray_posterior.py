@@ -132,7 +132,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass
     )
 
 
-def test_rays_see_what_their_way_in_common_lets_through() -> None:
+def test_rays_see_what_their_shared_path_lets_through() -> None:
     """Two keyframes have seen a wall in front of the surface that a third one's rays measure."""
     camera, sigma, far = PinholeCamera(2, 1, 20.0, 20.0, 0.5, 0.0), 0.03, np.full((1, 2), 1.2, np.float32)
     config = InferenceConfig(ray_density=1e3)  # both pixels have a ray, and are one group

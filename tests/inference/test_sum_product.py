@@ -125,7 +125,7 @@ def test_loops_equal_the_numpy_schedule(
     free_share: float,
     alone: bool,
 ) -> None:
-    """By each ray for itself, and by rays with a way in common."""
+    """By each ray for itself, and by rays with a shared path."""
     rng = np.random.default_rng(seed)
     focal = 8.0 if alone else 20.0  # pixels close enough for a group, and never for one ray
     camera = PinholeCamera(pixels[0], pixels[1], focal, focal, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)

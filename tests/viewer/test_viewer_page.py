@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import viser
 from handled_page import HandledPage
+from numpy.typing import NDArray
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
 
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -248,6 +249,49 @@ def test_measured_points_lie_where_their_keyframe_is(handled: LivePage) -> None:
     page._take_options()
     page._flush()
     assert not node.visible
+
+
+def test_voxels_of_an_earlier_map_are_pale_until_todays_keyframes_change_them(
+    handled: LivePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("taichi_mrf.viewer.scene.map_scene.UPDATES_PER_SECOND", 1e9)
+    bricks, nothing = np.array([[0, 0, 0], [0, 0, 1]], np.int32), np.zeros((0, 3), np.int32)
+
+    def put(these: NDArray[np.int32], log_odds: int) -> None:
+        values = np.full((len(these), 512), log_odds, np.int16), np.zeros((len(these), 512), np.uint8)
+        handled.take(m.Bricks("map", these, *values, nothing))
+
+    def colors() -> NDArray[np.uint8]:
+        """Of the voxels of both bricks, by brick: the colours that were sent last."""
+        handled.page._flush()
+        sent = handled.page.map.layers["map"]._sent[0, 0, 0]
+        upper = sent.cells[:, 2] >= 8
+        return np.stack([sent.colors[~upper], sent.colors[upper]]).astype(int)
+
+    handled.take(replace(HELLO, located="3 cm, 0.8 degrees, 91% of what is seen agrees"))
+    handled.page.panel.view_options.handles["look"].value = "voxels by height"
+    handled.page._take_options()
+    put(bricks, 100)
+    handled.take(replace(keyframe(0), earlier=True))
+    usual = colors()
+    handled.take(keyframe(1))
+    assert (colors() == usual // 2 + 128).all()  # nothing of today is in the map yet
+    put(bricks[1:], 101)
+    first, second = colors()
+    assert (first == usual[0] // 2 + 128).all()
+    assert (second == usual[1]).all()
+    put(bricks[1:], 100)  # today's keyframe is taken back
+    assert (colors() == usual // 2 + 128).all()
+
+
+def test_voxels_of_a_map_of_its_own_are_never_pale(handled: LivePage) -> None:
+    bricks, nothing = np.array([[0, 0, 0]], np.int32), np.zeros((0, 3), np.int32)
+    handled.take(HELLO)
+    values = np.full((1, 512), 100, np.int16), np.ones((1, 512), np.uint8)
+    handled.take(m.Bricks("map", bricks, *values, nothing))
+    handled.take(keyframe(0))
+    handled.page._flush()
+    assert not handled.page.map.store.shown((0, 0, 0), 0.0, None).is_earlier.any()
 
 
 def test_free_space_is_seen_in_a_cut_that_goes_with_the_look(handled: LivePage) -> None:

@@ -58,7 +58,7 @@ NOTES = (
     "Anchored: with the first frames laid on each other; so are the largest error and that at the end.",
     "Unsure: frames of which tracking says that their points do not determine all six degrees of freedom. "
     "Steps: RMS error of the motion to such a frame, and to others.",
-    "CPU: processor time for tracking and adding keyframes, for each frame.",
+    "CPU: CPU time for tracking and adding keyframes, for each frame.",
     "Open3D: odometry from image to image, by depth alone or, in colour, by both, to 4.5 m; its pose graph "
     "connects every fifth image with those that the odometry places within 1 m and 0.6 radians.",
 )

@@ -56,13 +56,11 @@ def write_figure(figure: "Figure", path: Path) -> None:
 
 
 def draw_way(axes: "Axes", points: NDArray[np.floating]) -> None:
-    """Draw the way of the camera through the keyframes, (N, 2) in the axes' units, and its legend."""
+    """Draw the camera path through the keyframes, (N, 2) in the axes' units, and its legend."""
     if len(points) == 0:
         return
     axes.plot(*points.T, color="white", linewidth=3.0)
-    axes.plot(
-        *points.T, color=_WAY_COLOR, linewidth=1.4, marker=".", markersize=3.0, label="way of the camera"
-    )
+    axes.plot(*points.T, color=_WAY_COLOR, linewidth=1.4, marker=".", markersize=3.0, label="camera path")
     axes.plot(
         *points[0], "o", color=_WAY_COLOR, markeredgecolor="white", markersize=8.0, label="first keyframe"
     )

@@ -159,7 +159,7 @@ def budgets(rows: Sequence[Row]) -> Table:
     notes = [
         "Share of pixels of held-out views whose first surface is right within 1.5 voxels / mean "
         "log-likelihood of a pixel, each by the setting that is best of those within the budget of "
-        "processor time a frame."
+        "CPU time a frame."
     ]
     columns = [f"{budget:g} ms" for budget in BUDGETS_MS]
     title = "Every peer: what it reaches within a budget"
@@ -174,7 +174,7 @@ def settings(rows: Sequence[Row]) -> Table:
         costs: list[Entry] = [result["cpu_ms"], result["cpu_ms_keyframe"], result["memory_mb"]]
         entries.append([*row.head, *costs, *(result["answers"][name] for name in ANSWERS)])
     notes = [
-        "ms: processor time of all threads, a frame of the sequence and a keyframe that is mapped. MB: the "
+        "ms: CPU time of all threads, a frame of the sequence and a keyframe that is mapped. MB: the "
         "map's own figure. Shares of the pixels of held-out views whose first surface is right; pixels "
         "without an answer are wrong. Log-likelihood: nats, density per metre.",
         "Recursive maps are read with or without the voxels that are likelier free, whichever is right "

@@ -341,7 +341,7 @@ def plan_figure(plans: Mapping[str, Result], scene: Scene, voxel_size: float) ->
             f"which covers {100 * drawn['coverage']:.0f} %",
             xlim=extent[:2], ylim=extent[2:],
         )  # fmt: skip
-    axes_of_all[-1].set_xlabel("metres ahead; black: way of the camera")
+    axes_of_all[-1].set_xlabel("metres ahead; black: camera path")
     figure.colorbar(
         shown, ax=list(axes_of_all), location="bottom", shrink=0.5, aspect=40, pad=0.01,
         label="highest voxel (m above the camera)",

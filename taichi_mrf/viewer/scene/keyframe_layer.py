@@ -16,6 +16,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.viewer.messages import CurrentCamera, KeyframeInfo
+from taichi_mrf.viewer.scene.coloring import pale
 
 FRUSTUM_M = 0.075
 """Distance of a frustum's picture from its camera, metres."""
@@ -33,11 +34,6 @@ _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
-
-
-def pale(color: ArrayLike) -> NDArray[np.uint8]:
-    """Colours of a keyframe of an earlier map: RGB (..., 3), half way to white."""
-    return (np.asarray(color, np.uint8) // 2 + 128).astype(np.uint8)
 
 
 def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

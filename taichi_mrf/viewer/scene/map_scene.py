@@ -133,6 +133,12 @@ class MapScene:
         layer.changed |= store.remove(bricks.removed)
         self._news_at = time.monotonic()
 
+    def note_earlier(self) -> None:
+        """The map so far is that of an earlier recording: its voxels are pale until today's keyframes change
+        them."""
+        self.store.note_earlier()
+        self.layers["map"].changed |= set(self.store.chunks)
+
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""
         self.layers["map"].changed |= self.store.put(colors.bricks, colors=colors.colors)

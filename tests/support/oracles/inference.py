@@ -45,7 +45,7 @@ class Ray:
 
 @dataclass(frozen=True)
 class Group:
-    """Rays with a way in common through the middle of their pixels; their own ways begin where it ends."""
+    """Rays with a shared path through the middle of their pixels; their own ways begin where it ends."""
 
     common: list[Segment]
     rays: list[Ray]
@@ -139,7 +139,7 @@ def ray_messages(
 def group_messages(
     group: Group, incoming: dict[Voxel, float], config: InferenceConfig, limits: Limits
 ) -> list[tuple[Voxel, float, float]]:
-    """Messages of a group: the way in common counts for each of its rays, and has the mean of what lies
+    """Messages of a group: the shared path counts for each of its rays, and has the mean of what lies
     behind them."""
     passed, visibility = [], 1.0
     for segment in group.common:
