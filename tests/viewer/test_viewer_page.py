@@ -24,6 +24,7 @@ from taichi_mrf.viewer.transport import downloads
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
+DONE = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
 
 
 def keyframe(id: int, x: float = 0.0, state: m.KeyframeState = "on") -> m.KeyframeInfo:
@@ -176,26 +177,40 @@ def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> 
     assert list(handled.page.panel._edits.options) == ["On/off", "Move", "Put back"]
 
 
-def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: LivePage) -> None:
-    panel = handled.page.panel
-    assert list(panel._run.options) == ["Play", "Pause", "Step", "Reset"]
-    handled.take(replace(HELLO, has_frames=False))
+def test_controls_of_a_replay_are_there_while_frames_are_to_come(handled: LivePage) -> None:
+    panel, status = handled.page.panel, replace(DONE, finished=False)
+    for done in (False, True, False):
+        handled.take(replace(status, finished=done))
+        assert list(panel._run.options) == (["Reset"] if done else ["Play", "Pause", "Step", "Reset"])
+    handled.take(replace(HELLO, has_frames=False), DONE)
     assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
     assert not panel.view_options.handles["follow"].visible
 
 
 def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> None:
-    speed = handled.page.panel.speed
-    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
+    speed, status = handled.page.panel.speed, DONE  # of the next replay, too
     for factor, name in ((None, None), (2.0, "2x"), (3.0, "3x")):
         handled.take(replace(status, speed=factor))
         assert (speed.value if speed.visible else None) == name
 
 
+def test_an_empty_map_says_what_it_waits_for(handled: LivePage) -> None:
+    handled.take(HELLO)  # without the keyframes
+    for finished, said in ((False, "waits; it is empty until the first"), (True, "waits; no frame became")):
+        handled.take(replace(DONE, activity="waits", voxels=0, finished=finished))
+        assert said in handled.page.panel._activity.content
+    handled.take(keyframe(0), replace(DONE, activity="waits"))
+    assert ">waits<" in handled.page.panel._activity.content
+
+
+def test_the_size_of_the_file_is_said_before_it_is_written(handled: LivePage) -> None:
+    handled.take(replace(DONE, memory_mb=1234.4))
+    assert "at most about 1,234 MB" in handled.page.panel._size.content
+
+
 def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
-    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
-    numbers = handled.page.panel._numbers
+    status, numbers = DONE, handled.page.panel._numbers
     handled.take(status)
     assert "not calibrated" in numbers.content
     handled.take(replace(status, free_space="promised at 99%: 98.9 to 99.3% held"))

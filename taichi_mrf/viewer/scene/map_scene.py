@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import viser
+import viser.transforms as vtf
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -115,6 +116,14 @@ class MapScene:
         """Centres (n, 3) of all voxels of the map that are shown, in metres, world; of the surface its
         vertices."""
         return self.surface.points() if self.shows_surface else self.layers["map"].points()
+
+    def seen_points(self) -> NDArray[np.float64]:
+        """Points (n, 3) of all that is seen of both maps, in metres, world."""
+        seen = self.points()
+        if self._shows == "points" and self._points is not None and self._measured is not None:
+            turned = vtf.SO3(self._points.wxyz).apply(self._measured.points_m.astype(np.float64))
+            seen = turned + self._points.position
+        return np.concatenate([seen, self.layers["baseline"].points()])
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
