@@ -42,7 +42,7 @@ let timer, socket, theme, wasOpen = false, closed = false, hasClosed = false, in
 const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
 const preferred = () => system.matches ? "dark" : "light";
 const numbers = location.hash.match(/^#view=([-+.,\\de]+)$/)?.[1].split(",").map(Number) ?? [];
-const isLink = numbers.length === 12 && numbers.every(Number.isFinite);
+const isLink = [9, 12].includes(numbers.length) && numbers.every(Number.isFinite);
 const linked = isLink ? {
   SetCameraPositionMessage: ["position", numbers.slice(0, 3)],
   SetCameraLookAtMessage: ["look_at", numbers.slice(3, 6)],
@@ -62,7 +62,7 @@ window.Worker = class extends Worker {  // viser's socket lives in one, which te
           message[name] = value;
           delete linked[message.type];
           const lens = ["Fov", "Near", "Far"].map((part, i) => [part, numbers[9 + i]]);
-          if (name === "look_at") lens.forEach(([part, value]) => data.messages.push(
+          if (name === "look_at" && numbers.length === 12) lens.forEach(([part, value]) => data.messages.push(
             {type: `SetCamera${part}Message`, [part.toLowerCase()]: value, initial: false}));
         }
         if (message.type !== "ThemeConfigurationMessage") continue;
