@@ -148,7 +148,8 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
             raise
         console.print_line(f"It cannot be mapped like this: {error}")
         for name in bag.sources:
-            console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(ROBOTS)))
+            if bag.flags or name != source:  # that has just been refused, and the error says what it needs
+                console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(ROBOTS)))
         return False
     usable = _print_frames(console, format_name(source), dataset)
     if usable:

@@ -27,6 +27,9 @@ _SAME = 1e-7
 _SHORTER_UNITS = {1e3: ("ms", "milliseconds"), 1e6: ("us", "microseconds"), 1e9: ("ns", "nanoseconds")}
 """Units by how many are a second."""
 
+_SINCE_1970_S = 1e8
+"""Such stamps may have been larger numbers, which are read as milliseconds since 1970 or as shorter units."""
+
 _OF_ONE_TIME = 0.5
 """Least share of the data within the time of the poses, for both to be of one recording."""
 
@@ -81,15 +84,16 @@ def check_unit(
         return
     short, unit = _SHORTER_UNITS[times]
     faster, slower = ("the poses", f"the {what}") if power > 0 else (f"the {what}", "the poses")
-    remedy = (
-        f"add the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers"
-        if power > 0
-        else f"divide those of the {what} by {times:.0f}"
-    )
+    so, remedy = f"so they seem to be {unit}", f"divide those of the {what} by {times:.0f}"
+    if power > 0 and times < max(_SHORTER_UNITS) and min(posed) >= _SINCE_1970_S:
+        so = "so their unit is not the one that was taken"
+        remedy = "add the line '# stamp_ns tx ty tz qx qy qz qw' (or stamp_us, stamp_ms) above its numbers"
+    elif power > 0:
+        remedy = f"add the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers"
     of_poses, of_data = (f"{min(each):.6g} to {max(each):.6g}" for each in (posed, stamps))
     raise DatasetError(
         f"{where}: the stamps of {faster} are {times:.0f} times those of {slower} ({source}: {of_poses}, "
-        f"{what}: {of_data}), so they seem to be {unit}: {remedy}"
+        f"{what}: {of_data}), {so}: {remedy}"
     )
 
 

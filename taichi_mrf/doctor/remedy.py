@@ -1,12 +1,14 @@
 """The command that reads a recording as it was written: opened with the flags that were found, and compared
 once more, before anybody is told of it."""
 
+import contextlib
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AXIAL, conventions_of
+from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -78,6 +80,13 @@ def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceF
         if as_written == keywords:
             raise
         dataset = open_posed(source, poses, color=False, **keywords)
+    if as_written != keywords:
+        # An assumed scale of depth may have given way to another at the poses as the flags have them.
+        with contextlib.suppress(DatasetError, ConfigError):
+            steps = _steps_of(open_posed(source, poses, color=False, **keywords))
+            if steps != _steps_of(dataset):
+                as_written["depth_scale"] = steps
+                dataset = open_posed(source, poses, color=False, **as_written)
     try:
         return diagnose(dataset, said)
     except FrameError as unread:  # such as images whose rows are the columns that the camera states
@@ -86,6 +95,13 @@ def _diagnose_as_written(source: str, poses: str | Path | None, reading: SourceF
             return diagnose(as_stored(turned), said)
         except (DatasetError, ConfigError):
             raise unread from None
+
+
+def _steps_of(dataset: Dataset) -> float | None:
+    """Steps of depth per metre; None where no image counts in steps."""
+    while isinstance(dataset, Derived):
+        dataset = dataset.source
+    return getattr(dataset, "steps_per_metre", None)
 
 
 def _with_flags(reading: SourceFlags, flags: list[str]) -> SourceFlags:

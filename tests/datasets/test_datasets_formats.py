@@ -180,6 +180,16 @@ def test_stamps_in_another_unit_than_the_images_are_named_with_the_remedy(
     refused(folder, "those of the poses", f"divide those of the depth images by {times:.0f}")
 
 
+def test_the_remedy_mends_stamps_of_a_clock_that_are_as_large_as_those_of_1973(tmp_path: Path) -> None:
+    """Nanoseconds from the 100th second on are taken for milliseconds since 1970."""
+    folder = write_tum(tmp_path, Content(24), 100.0)
+    rescaled(folder / "groundtruth.txt", 1e9)
+    said = refused(folder, "their unit is not the one that was taken", "(or stamp_us, stamp_ms)")
+    (line,) = re.findall("'(# stamp_.*?)'", said)
+    rescaled(folder / "groundtruth.txt", 1.0, line)
+    assert len(open_dataset(folder)) == 24
+
+
 def test_tum_without_colour_and_unsorted(tmp_path: Path) -> None:
     content = Content(4)
     folder = write_tum(tmp_path, content)

@@ -30,11 +30,11 @@ def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
 
 
-def fill(bag: Bag, poses: tuple[str, ...]) -> None:
-    bag.camera_info("/camera/depth/camera_info", "optical", CAMERA)
+def fill(bag: Bag, poses: tuple[str, ...], frame: str = "optical", camera: str = "optical") -> None:
+    bag.camera_info("/camera/depth/camera_info", camera, CAMERA)
     for i in range(11):
         depth = np.full(CAMERA.shape, 1000 + 100 * i, np.uint16)
-        bag.image("/camera/depth/image_raw", 0.5 * i, "optical", depth, "16UC1")
+        bag.image("/camera/depth/image_raw", 0.5 * i, frame, depth, "16UC1")
         for topic in poses:
             bag.pose_stamped(topic, 0.5 * i, "map", look_at([0.1 * i, 0, 0], [9, 0, 0]))
         bag.tf("/tf", 0.5 * i, "odom", "base", look_at([0.1 * i, 0, 0], [9, 0, 0]))
@@ -72,6 +72,35 @@ def test_info_of_a_bag_that_leaves_a_choice_suggests_all_of_them(tmp_path: Path)
     assert sources == [f"{tmp_path / 'walk'}?pose={name}" for name in ("/slam/pose", "/vio/pose", "tf")]
     for source in sources:
         assert len(open_dataset(source)) == 11
+
+
+@pytest.mark.parametrize(
+    ("frame", "poses", "query"),
+    [
+        ("", (), "?optical=FRAME"),
+        ("unheard_of", (), "?optical=FRAME"),
+        ("", ("/slam/pose",), "?pose=/slam/pose&optical=FRAME"),
+    ],
+)
+def test_info_of_a_bag_whose_images_are_of_no_known_frame_suggests_to_name_it(
+    tmp_path: Path, frame: str, poses: tuple[str, ...], query: str
+) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        fill(bag, poses, frame, frame)
+    status, out, errors = said("info", tmp_path / "walk")
+    assert (status, errors) == (2, "")
+    commands = [shlex.split(line) for line in out.splitlines() if line.startswith("taichi-mrf map")]
+    assert commands[0][2] == f"{tmp_path / 'walk'}{query}"
+    assert len(open_dataset(commands[0][2].replace("FRAME", "optical"))) == 11
+
+
+def test_info_of_a_bag_does_not_suggest_what_it_refuses(tmp_path: Path) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        fill(bag, (), camera="rear")
+    status, out, errors = said("info", tmp_path / "walk")
+    assert (status, errors) == (2, "")
+    assert "It cannot be mapped like this" in out
+    assert f"taichi-mrf map {tmp_path / 'walk'} --out" not in out
 
 
 def test_info_of_bags_that_need_more(tmp_path: Path) -> None:
@@ -143,7 +172,7 @@ def test_info_of_the_room(one_backend: str) -> None:
     status, out, errors = said("info", "synthetic:room?frames=3&width=40&height=30", "--arch", one_backend)
     assert (status, errors) == (0, "")
     assert re.search(r"format +│ +synthetic:room", out)
-    assert re.search(r"way +│ +x -?\d+\.\d\d to", out)
+    assert re.search(r"camera path +│ +x -?\d+\.\d\d to", out)
 
 
 @pytest.mark.parametrize(

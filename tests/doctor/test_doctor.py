@@ -25,7 +25,7 @@ from taichi_mrf.doctor.diagnosis import Diagnosis, Finding, diagnose, doubtful_a
 from taichi_mrf.doctor.picture import overlap
 from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import DatasetError, ReadWrongError
-from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.geometry.poses import inverse, look_at
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.source import open_source
 
@@ -422,6 +422,16 @@ def test_the_unit_of_depth_is_sought_at_poses_in_the_unit_that_is_said(
 ) -> None:
     dataset = open_dataset(write_numbered(tmp_path / "mine", room, unit=1000), poses_are="mm", color=False)
     np.testing.assert_allclose(dataset.read(3).depth_m, room[3].depth_m, atol=6e-4)
+
+
+@pytest.mark.parametrize("words", ["mm", "inverse"])
+def test_a_unit_of_depth_that_is_found_at_poses_as_they_are_said_is_not_asked_for(
+    room: list[Frame], words: str, tmp_path: Path
+) -> None:
+    frames = [replace(f, T_world_camera=inverse(f.T_world_camera)) for f in room]
+    folder = write_numbered(tmp_path / "mine", *((room, 1000, 1000) if words == "mm" else (frames,)))
+    found = remedy(str(folder), None, SourceFlags(poses_are=words))
+    assert (found.found.findings, found.command) == ((), "")
 
 
 def test_the_unit_of_depth_is_sought_at_the_poses_of_a_file_too(room: list[Frame], tmp_path: Path) -> None:

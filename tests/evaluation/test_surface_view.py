@@ -90,3 +90,14 @@ def test_the_plan_shows_the_surface_and_no_ceiling() -> None:
     assert drawn[edge:-edge, edge:-edge].all(), "the floor, without holes"
     middle = picture[picture.shape[0] // 2, picture.shape[1] // 2].astype(int)
     assert middle[2] > middle[1], "the colour of low things"
+
+
+def test_the_plan_is_not_half_empty_for_what_was_seen_through_a_door() -> None:
+    floor, triangles = _steps(np.ones((20, 20), bool))
+    specks, of_speck = _steps(np.ones((1, 1), bool))
+    vertices_m = np.concatenate([floor, specks + 60 * np.array([0.0, 1.0, 0.0])])
+    triangles = np.concatenate([triangles, of_speck + len(floor)])
+    room = DrawnMap(np.full((1, 3), 20.0), UP[None], 0.05, UP, [])
+    surface = DrawnSurface(vertices_m, triangles, np.tile(UP, (len(vertices_m), 1)), None)
+    axes = top_view(room, surface).axes[0]
+    assert axes.images[0].get_extent()[2:] == pytest.approx((0, 20), abs=1.5)

@@ -402,8 +402,12 @@ def test_a_link_begins_with_the_view_that_it_was_made_of(
     page.page.mouse.move(400, 600)
     page.page.mouse.wheel(0, -300)
     page.until(lambda seen: np.linalg.norm(np.subtract(page.position(), first)) > 0.1, "another view")
+    lens = "() => ['fov', 'near', 'far'].map(name => window.__viserMutable.camera[name])"
+    wide = page.page.evaluate(lens)
+    page.press("Top")
+    page.until(lambda seen: page.page.evaluate(lens)[0] < wide[0], "a longer lens")
     page.pause(1.0)
-    eye = page.position()
+    eye, long = page.position(), page.page.evaluate(lens)
     page.tab("Save")
     page.press("Link to this view")
     page.until(lambda seen: "now leads to this view" in page.text(), "the notification")
@@ -414,12 +418,13 @@ def test_a_link_begins_with_the_view_that_it_was_made_of(
         other.until_settled()
         other.pause(1.0)
         np.testing.assert_allclose(other.position(), eye, atol=1e-3)
+        np.testing.assert_allclose(other.page.evaluate(lens), long, rtol=0.01)
         assert other.problems == []
     page.page.evaluate(
         "history.replaceState(null, '', location.pathname + location.search)"
     )  # for later tests
     page.tab("Map")
-    page.press("Fit")
+    page.press("Home")
 
 
 def test_two_viewers_in_a_wide_and_a_narrow_window(

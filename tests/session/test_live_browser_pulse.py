@@ -91,9 +91,9 @@ def has_reloaded(page: LivePage) -> bool:
         return False
 
 
-def until_reconnected(page: LivePage, slider_before: str | None, voxels: int) -> None:
+def until_reconnected(page: LivePage, list_before: str | None, voxels: int) -> None:
     """Wait until the same page shows the whole map of another viewer, and see that its slider is answered."""
-    page.until(lambda seen: slider_id(page) != slider_before, "another viewer")
+    page.until(lambda seen: list_id(page) != list_before, "another viewer")
     until_it_says(page, DONE)
     assert not has_reloaded(page)
     assert page.until_settled().voxels == voxels
@@ -104,9 +104,9 @@ def until_reconnected(page: LivePage, slider_before: str | None, voxels: int) ->
     assert all(problem.startswith(NO_SERVER) for problem in page.problems), page.problems
 
 
-def slider_id(page: LivePage) -> str | None:
-    """Of the slider of the threshold; another viewer gives it another one."""
-    return page.input("Threshold").get_attribute("id")
+def list_id(page: LivePage) -> str | None:
+    """Of the list of looks; another viewer gives it another one."""
+    return page.input("Look").get_attribute("id")
 
 
 def viewer_of(program: LiveProgram) -> int:
@@ -120,6 +120,9 @@ def test_a_page_says_what_does_not_answer(program: LiveProgram, page: LivePage) 
         until_it_says(page, DONE)
         os.kill(stopped, signal.SIGSTOP)
         until_it_says(page, words)
+        line, head = page.page.locator("#cut-off"), page.page.get_by_text("taichi_mrf: ")
+        ends = line.bounding_box(), head.bounding_box()
+        assert ends[0]["x"] + ends[0]["width"] <= ends[1]["x"], "beside the panel, not over it"
         page.screenshot(words.replace(" ", "_").replace(":", ""))
         os.kill(stopped, signal.SIGCONT)
     until_it_says(page, DONE)
@@ -127,21 +130,21 @@ def test_a_page_says_what_does_not_answer(program: LiveProgram, page: LivePage) 
 
 
 def test_a_viewer_that_dies_is_started_again(program: LiveProgram, page: LivePage) -> None:
-    voxels, slider, viewer = page.until_settled().voxels, slider_id(page), viewer_of(program)
+    voxels, looks, viewer = page.until_settled().voxels, list_id(page), viewer_of(program)
     os.kill(viewer, signal.SIGKILL)
     wait_for(lambda: viewer not in program.group(), "its end")
-    until_reconnected(page, slider, voxels)
+    until_reconnected(page, looks, voxels)
 
 
 def test_a_server_that_is_killed_and_restarted_is_found_again(program: LiveProgram, page: LivePage) -> None:
-    voxels, slider = page.until_settled().voxels, slider_id(page)
+    voxels, looks = page.until_settled().voxels, list_id(page)
     os.kill(program.pid, signal.SIGKILL)
     assert program.wait() == -signal.SIGKILL
     until_it_says(page, DISCONNECTED)
     program.wait_until_nothing_is_left()
     with LiveProgram(*ARGUMENTS, port=program.port) as again:
         assert again.port == program.port
-        until_reconnected(page, slider, voxels)
+        until_reconnected(page, looks, voxels)
         page.screenshot("server_restarted")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import viser
 from handled_page import HandledPage
+from numpy.typing import NDArray
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
 
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -23,6 +24,7 @@ from taichi_mrf.viewer.transport import downloads
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
+DONE = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
 
 
 def keyframe(id: int, x: float = 0.0, state: m.KeyframeState = "on") -> m.KeyframeInfo:
@@ -175,26 +177,40 @@ def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> 
     assert list(handled.page.panel._edits.options) == ["On/off", "Move", "Put back"]
 
 
-def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: LivePage) -> None:
-    panel = handled.page.panel
-    assert list(panel._run.options) == ["Play", "Pause", "Step", "Reset"]
-    handled.take(replace(HELLO, has_frames=False))
+def test_controls_of_a_replay_are_there_while_frames_are_to_come(handled: LivePage) -> None:
+    panel, status = handled.page.panel, replace(DONE, finished=False)
+    for done in (False, True, False):
+        handled.take(replace(status, finished=done))
+        assert list(panel._run.options) == (["Reset"] if done else ["Play", "Pause", "Step", "Reset"])
+    handled.take(replace(HELLO, has_frames=False), DONE)
     assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
     assert not panel.view_options.handles["follow"].visible
 
 
 def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> None:
-    speed = handled.page.panel.speed
-    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
+    speed, status = handled.page.panel.speed, DONE  # of the next replay, too
     for factor, name in ((None, None), (2.0, "2x"), (3.0, "3x")):
         handled.take(replace(status, speed=factor))
         assert (speed.value if speed.visible else None) == name
 
 
+def test_an_empty_map_says_what_it_waits_for(handled: LivePage) -> None:
+    handled.take(HELLO)  # without the keyframes
+    for finished, said in ((False, "waits; it is empty until the first"), (True, "waits; no frame became")):
+        handled.take(replace(DONE, activity="waits", voxels=0, finished=finished))
+        assert said in handled.page.panel._activity.content
+    handled.take(keyframe(0), replace(DONE, activity="waits"))
+    assert ">waits<" in handled.page.panel._activity.content
+
+
+def test_the_size_of_the_file_is_said_before_it_is_written(handled: LivePage) -> None:
+    handled.take(replace(DONE, memory_mb=1234.4))
+    assert "at most about 1,234 MB" in handled.page.panel._size.content
+
+
 def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
-    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
-    numbers = handled.page.panel._numbers
+    status, numbers = DONE, handled.page.panel._numbers
     handled.take(status)
     assert "not calibrated" in numbers.content
     handled.take(replace(status, free_space="promised at 99%: 98.9 to 99.3% held"))
@@ -233,6 +249,49 @@ def test_measured_points_lie_where_their_keyframe_is(handled: LivePage) -> None:
     page._take_options()
     page._flush()
     assert not node.visible
+
+
+def test_voxels_of_an_earlier_map_are_pale_until_todays_keyframes_change_them(
+    handled: LivePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("taichi_mrf.viewer.scene.map_scene.UPDATES_PER_SECOND", 1e9)
+    bricks, nothing = np.array([[0, 0, 0], [0, 0, 1]], np.int32), np.zeros((0, 3), np.int32)
+
+    def put(these: NDArray[np.int32], log_odds: int) -> None:
+        values = np.full((len(these), 512), log_odds, np.int16), np.zeros((len(these), 512), np.uint8)
+        handled.take(m.Bricks("map", these, *values, nothing))
+
+    def colors() -> NDArray[np.uint8]:
+        """Of the voxels of both bricks, by brick: the colours that were sent last."""
+        handled.page._flush()
+        sent = handled.page.map.layers["map"]._sent[0, 0, 0]
+        upper = sent.cells[:, 2] >= 8
+        return np.stack([sent.colors[~upper], sent.colors[upper]]).astype(int)
+
+    handled.take(replace(HELLO, located="3 cm, 0.8 degrees, 91% of what is seen agrees"))
+    handled.page.panel.view_options.handles["look"].value = "voxels by height"
+    handled.page._take_options()
+    put(bricks, 100)
+    handled.take(replace(keyframe(0), earlier=True))
+    usual = colors()
+    handled.take(keyframe(1))
+    assert (colors() == usual // 2 + 128).all()  # nothing of today is in the map yet
+    put(bricks[1:], 101)
+    first, second = colors()
+    assert (first == usual[0] // 2 + 128).all()
+    assert (second == usual[1]).all()
+    put(bricks[1:], 100)  # today's keyframe is taken back
+    assert (colors() == usual // 2 + 128).all()
+
+
+def test_voxels_of_a_map_of_its_own_are_never_pale(handled: LivePage) -> None:
+    bricks, nothing = np.array([[0, 0, 0]], np.int32), np.zeros((0, 3), np.int32)
+    handled.take(HELLO)
+    values = np.full((1, 512), 100, np.int16), np.ones((1, 512), np.uint8)
+    handled.take(m.Bricks("map", bricks, *values, nothing))
+    handled.take(keyframe(0))
+    handled.page._flush()
+    assert not handled.page.map.store.shown((0, 0, 0), 0.0, None).is_earlier.any()
 
 
 def test_free_space_is_seen_in_a_cut_that_goes_with_the_look(handled: LivePage) -> None:

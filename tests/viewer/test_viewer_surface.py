@@ -252,3 +252,20 @@ def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> No
     asked = drawn.asked[-1]
     assert isinstance(asked, m.RayThrough)
     assert asked.point == pytest.approx((3.0, -3.0, 2.0))
+
+
+def test_options_without_effect_are_hidden(drawn: SurfacePage) -> None:
+    def used() -> set[str]:
+        handles = drawn.page.panel.view_options.handles
+        return {name for name in ("threshold", "size", "shade") if handles[name].visible}
+
+    drawn.take(status(finished=False))
+    drawn.draw()
+    assert used() == {"threshold", "size", "shade"}  # voxels take the place of the surface
+    drawn.take(status())
+    assert drawn.draw().startswith("2 tri")
+    assert used() == {"shade"}
+    drawn.draw(look="measured points of the keyframe")
+    assert used() == set()
+    drawn.draw(look="voxels by height")
+    assert used() == {"threshold", "size", "shade"}

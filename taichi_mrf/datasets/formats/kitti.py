@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import velodyne_sequence
-from taichi_mrf.datasets.lidar.clouds import natural, number_of, read_cloud
+from taichi_mrf.datasets.lidar.clouds import layout_notes, natural, number_of, read_cloud
 from taichi_mrf.datasets.lidar.registered import in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
@@ -98,6 +98,7 @@ def open_scans(path: Path, options: ReadOptions) -> Dataset:
         notes.append(
             f"{dropped} of {len(files)} scans dropped: {poses.path.name} or {TIMES} ends before them"
         )
+    notes += layout_notes([file for file, _, _ in found])
     return lidar_scans(folder.name, scans, notes, dropped, options)
 
 

@@ -6,9 +6,9 @@ of the sensor. LZF (M. Lehmann's libLZF) is literal bytes, and repeats of earlie
 is ASCII, or binary of either byte order.
 """
 
+import contextlib
 import re
 import struct
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -404,7 +404,23 @@ def _array_name(file: NpzFile) -> str | None:
     return next((name for name in file.names if name in ARRAYS or _STEPS.fullmatch(name)), None)
 
 
+def layout_notes(clouds: Sequence[Path]) -> list[str]:
+    """How the first cloud that can be read was taken, where that is a guess that may be wrong."""
+    for path in clouds:
+        if path.suffix.lower() != ".bin":
+            continue
+        with contextlib.suppress(DatasetError):  # told when it is read
+            count = _float_table(path).shape[1]
+            said = f".bin files with {count} numbers a point, of which the first are x y z"
+            return [said] if count != _COLUMNS[0] else []
+    return []
+
+
 def _float_points(path: Path) -> NDArray[np.float64]:
+    return _float_table(path)[:, :3].astype(np.float64)
+
+
+def _float_table(path: Path) -> NDArray[np.float32]:
     """x y z, and as many more numbers as each point has (_COLUMNS), as little-endian float32."""
     data = read_bytes(path, DatasetError, "the scan is missing")
     fitting = [count for count in _COLUMNS if len(data) % (4 * count) == 0]
@@ -417,9 +433,7 @@ def _float_points(path: Path) -> NDArray[np.float64]:
     spread = {count: _spread(values.reshape(-1, count)) for count in fitting}
     best = min(spread.values())
     count = next(count for count in fitting if spread[count] < best + _CLEARLY)
-    if count != _COLUMNS[0]:
-        warnings.warn(f".bin files with {count} numbers a point, of which the first are x y z", stacklevel=2)
-    return values.reshape(-1, count)[:, :3].astype(np.float64)
+    return values.reshape(-1, count)
 
 
 def _spread(table: NDArray[np.float32]) -> float:

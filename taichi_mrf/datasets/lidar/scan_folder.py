@@ -25,6 +25,7 @@ from taichi_mrf.datasets.hints import unread_poses
 from taichi_mrf.datasets.lidar.clouds import (
     READERS,
     is_cloud,
+    layout_notes,
     natural,
     number_of,
     read_cloud,
@@ -253,6 +254,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     if dropped and poses is not None:
         notes.append(f"{dropped} of {len(clouds)} scans dropped: {poses.name} has no pose for them")
     name = path.name if is_folder(path) else path.stem
+    notes += layout_notes(posed)
     return lidar_scans(name, scans, notes, dropped, options, takes_scale=True)
 
 

@@ -334,7 +334,11 @@ def _pose_options(reader: TopicSource, tree: TransformTree, frame: str) -> list[
         poses = [f"pose={name}" for name in pose_candidates(reader, tree, frame)]
     except DatasetError:  # frames that form a cycle
         poses = []
-    return [[]] if len(poses) == 1 else [[pose] for pose in poses or ["poses=FILE"]]
+    unknown = tree.misses(frame) or (not frame and tree.frames and poses)
+    sensor = ["optical=FRAME"] if unknown else []
+    if not poses:
+        return [sensor or ["poses=FILE"]]
+    return [[]] if len(poses) == 1 and not sensor else [[pose, *sensor] for pose in poses]
 
 
 def _sources(reader: TopicSource, tree: TransformTree, frame: str, chosen: list[str]) -> list[str]:

@@ -142,15 +142,15 @@ def find_poses(
         return _of_body(reader, tree, optical, below, choice)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
+        if tree.misses(optical):
+            known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
+            problem = (
+                f"{reader.path}: the messages are of {known}: set the sensor's with ?optical=FRAME; tf has "
+                f"{', '.join(tree.frames)}. Or add ?poses=FILE, or ?poses=track"
+            )
         others = [name for name in topics_of(reader, *messages.POSES) if _is_apart(name, tree)]
         if others:
             problem += f". Those of other robots: ?pose={' or ?pose='.join(others)}"
-        if tree.frames and optical not in tree.frames:
-            known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
-            problem += (
-                f". The messages are of {known}: set the sensor's with ?optical=FRAME; tf has "
-                f"{', '.join(tree.frames)}"
-            )
         raise DatasetError(problem)
     if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
         return _from_tree(reader, tree, optical, choice)
@@ -409,9 +409,11 @@ def body_of(
             )
         if not _is_cameras(named):
             same = f"?body={optical}" if optical else f"?optical={named}"
+            listed = tree.frames and optical not in tree.frames
+            there = f". If tf names it otherwise, ?optical=FRAME: {', '.join(tree.frames)}" if listed else ""
             raise DatasetError(
                 f"the poses are of {named}, and no transform leads to {optical or 'the sensor'}: "
-                f"{same} uses them as the sensor's own, ?poses=FILE uses others"
+                f"{same} uses them as the sensor's own, ?poses=FILE uses others{there}"
             )
         return optical, (
             f", of {named}, assumed to be of the camera itself: "

@@ -105,6 +105,10 @@ class TransformTree:
             path.append(parent)
         return path
 
+    def misses(self, frame: str) -> bool:
+        """True if the tree moves and has no such frame: the sensor's has another name there."""
+        return frame not in self.frames and any(isinstance(e, TimedPoses) for _, e in self.edges.values())
+
     def connects(self, a: str, b: str) -> bool:
         """True if two frames are connected."""
         return a == b or self.ancestors(a)[-1] == self.ancestors(b)[-1]

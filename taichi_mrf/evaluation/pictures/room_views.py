@@ -119,7 +119,7 @@ def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
     R_level_world = level_rotation(room.up)
     level = (room.centres if surface is None else surface.vertices_m) @ R_level_world.T
     way = np.array([R_level_world @ T[:3, 3] for T in room.T_world_cameras]).reshape(-1, 3)
-    low, high = np.quantile(level, [0.002, 0.998], axis=0)
+    low, high = np.quantile(level, [0.01, 0.99], axis=0)  # without what a lidar saw through a door
     if len(way):
         low[:2], high[:2] = np.minimum(low, way.min(axis=0))[:2], np.maximum(high, way.max(axis=0))[:2]
     margin = 0.03 * (high - low)[:2].max() + room.voxel_size

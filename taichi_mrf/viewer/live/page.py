@@ -183,6 +183,9 @@ class Page(BasePage[Panel]):
                 self._ask_for_extras()
         if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
             change(self.panel.unsaved, visible=True)
+        is_first = not keyframe.earlier and all(k.earlier for k in self.keyframes.keyframes.values())
+        if self._hello.located and self.map is not None and is_first:
+            self.map.note_earlier()
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()
         if self.map is not None:

@@ -28,7 +28,6 @@ SWITCHES = tuple(f"switch off {place}" for place in range(5))
 
 _ASIDE_PX, _WIDTH_PX, _HEIGHT_PX = 65, 290, 430
 """Size of the panel with all buttons, and its distance from the voxel."""
-
 _LINE_COLOR = (255, 255, 255)
 
 
@@ -60,10 +59,11 @@ class Dragged(Event):
 RUN_BUTTONS = ("Play", "Pause", "Step", "Reset")
 HISTORY_BUTTONS = ("Undo", "Redo")
 COMMANDS = {
+    "Return to the opening view": ("Home", "H", None),
     "Look from the top": ("Top", "1", None),
     "Look from the front": ("Front", "2", None),
     "Look from the side": ("Side", "3", None),
-    "Fit the whole map into the window": ("Fit", "0", None),
+    "Fit what is seen into the window": ("Fit", "0", None),
     "Follow the camera, or stop following": ("Follow", "F", None),
     "Undo the last edit": ("Undo", "Z", "cmd/ctrl"),
     "Redo the edit": ("Redo", "Z", "cmd/ctrl+shift"),
@@ -111,8 +111,8 @@ class Panel(BasePanel):
         self.add_counts()
         self.add_buttons(
             "View",
-            ("Top", "Front", "Side", "Fit"),
-            "Keys 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
+            ("Home", "Top", "Front", "Side", "Fit"),
+            "Keys H, 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
             "with Shift held, to see which keyframes say what is there, and how large it is.",
         )
         self.view_options.add("follow")
@@ -137,6 +137,7 @@ class Panel(BasePanel):
             self._images_tab()
         with tabs.add_tab("Save", viser.Icon.DOWNLOAD):
             self.unsaved = gui.add_markdown("The map has changes that are not saved.", visible=False)
+            self._size = gui.add_markdown("")
             for name, hint in SAVE_BUTTONS.items():
                 self.add_button(name, hint)
         with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
@@ -155,8 +156,6 @@ class Panel(BasePanel):
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
         )
         self._edits.options = tuple(label for label in EDIT_BUTTONS if hello.can_freeze or label != "Freeze")
-        # A map from a file has no frames to come, and none that have come: it can only be opened anew.
-        self._run.options = RUN_BUTTONS if hello.has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if hello.has_frames else (CHOSEN_KEYFRAME,)
         self.view_options.handles["follow"].visible = hello.has_frames
         self.clear_notices()
@@ -186,9 +185,15 @@ class Panel(BasePanel):
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
-        self.show_activity(status.activity, status.share, not (status.paused or status.finished))
+        h, activity = self._hello, status.activity
+        coming = h.has_frames and not status.finished  # else there is nothing to play
+        change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
+        if not (status.voxels or self._names):
+            ended = h.has_frames and not coming
+            activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"
+        self.show_activity(activity, status.share, not (status.paused or status.finished))
         self._show_speed(status.speed)
-        h = self._hello
+        self._size.content = f"Map: at most about {max(status.memory_mb, 1):,.0f} MB, it is compressed."
         self._numbers.content = rows_html(
             {
                 "source": h.source,

@@ -115,10 +115,10 @@ class BasePage(Generic[P]):
         self.map = MapScene(self.server, hello)
 
     def look_from(self, side: Side, client: int) -> None:
-        """Show the whole map to one client."""
-        box = None if self.map is None else self.map.box_m()
-        if box is not None:
-            self.viewpoint.look_from(client, side, *box)
+        """Show all that is seen of the map to one client."""
+        points = np.zeros((0, 3)) if self.map is None else self.map.seen_points()
+        if len(points):
+            self.viewpoint.look_from(client, side, points)
 
     def notify(self, notice: m.Notice) -> None:
         """Show a notice in the list, and for some seconds in every browser."""
@@ -186,6 +186,8 @@ class BasePage(Generic[P]):
         self.show_counts()
         self._offer_cuts()
         with_baseline = bool(self.map.layers["baseline"].store.chunks)
+        shaded = with_baseline or self.options.shows != "points"
+        self.panel.show_used(with_baseline or (shaded and not self.map.shows_surface), shaded)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline
             self.viewpoint.look_at_everything()

@@ -154,6 +154,11 @@ class BasePanel:
             middle = round((low + high) / 2, 2) if in_middle else min(max(slider.value, low), high)
             change(slider, min=low, max=high, value=middle)
 
+    def show_used(self, voxels: bool, shaded: bool) -> None:
+        """Show the options of voxels, and that of shapes, while they have an effect."""
+        for name, used in (("threshold", voxels), ("size", voxels), ("shade", shaded)):
+            change(self.view_options.handles[name], visible=used)
+
     def show_legend(self, legend_html: str) -> None:
         """Show the scale of the colours."""
         self._legend.content = legend_html

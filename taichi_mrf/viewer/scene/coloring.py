@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.method import Range
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Hello
@@ -280,6 +280,11 @@ def voxel_colors(
     if facing is None:
         return scale.colors[numbers]
     return scale.shaded[facing.astype(np.int32) * 256 + numbers]
+
+
+def pale(color: ArrayLike) -> NDArray[np.uint8]:
+    """Colours of what is of an earlier map: RGB (..., 3), half way to white."""
+    return (np.asarray(color, np.uint8) // 2 + 128).astype(np.uint8)
 
 
 def legend_html(scale: Scale) -> str:

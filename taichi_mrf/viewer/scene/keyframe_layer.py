@@ -16,11 +16,12 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.viewer.messages import CurrentCamera, KeyframeInfo
+from taichi_mrf.viewer.scene.coloring import pale
 
-FRUSTUM_M = 0.15
+FRUSTUM_M = 0.075
 """Distance of a frustum's picture from its camera, metres."""
 
-RING_M = 0.4
+RING_M = 0.2
 """Radius of the rings of a lidar, whose maps are of larger places, metres."""
 
 MOST_FROZEN = 50
@@ -33,11 +34,6 @@ _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
-
-
-def pale(color: ArrayLike) -> NDArray[np.uint8]:
-    """Colours of a keyframe of an earlier map: RGB (..., 3), half way to white."""
-    return (np.asarray(color, np.uint8) // 2 + 128).astype(np.uint8)
 
 
 def placement(T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -161,7 +157,7 @@ class KeyframeLayer:
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
-        self._outline("/camera", camera.T_world_camera, camera.camera, _WAY, thickness=3.0, enlarged=1.6)
+        self._outline("/camera", camera.T_world_camera, camera.camera, _WAY, thickness=3.0, enlarged=2.0)
 
     def grab(self) -> viser.TransformControlsHandle:
         """Put a gizmo on the chosen keyframe. There must be one."""

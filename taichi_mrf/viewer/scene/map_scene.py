@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import viser
+import viser.transforms as vtf
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -116,6 +117,14 @@ class MapScene:
         vertices."""
         return self.surface.points() if self.shows_surface else self.layers["map"].points()
 
+    def seen_points(self) -> NDArray[np.float64]:
+        """Points (n, 3) of all that is seen of both maps, in metres, world."""
+        seen = self.points()
+        if self._shows == "points" and self._points is not None and self._measured is not None:
+            turned = vtf.SO3(self._points.wxyz).apply(self._measured.points_m.astype(np.float64))
+            seen = turned + self._points.position
+        return np.concatenate([seen, self.layers["baseline"].points()])
+
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
         layer = self.layers["map" if bricks.layer == "dynamic" else bricks.layer]
@@ -123,6 +132,12 @@ class MapScene:
         layer.changed |= store.put(bricks.bricks, log_odds=bricks.log_odds, seen=bricks.seen)
         layer.changed |= store.remove(bricks.removed)
         self._news_at = time.monotonic()
+
+    def note_earlier(self) -> None:
+        """The map so far is that of an earlier recording: its voxels are pale until today's keyframes change
+        them."""
+        self.store.note_earlier()
+        self.layers["map"].changed |= set(self.store.chunks)
 
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""

@@ -11,8 +11,8 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import SurfaceView
 
-Side = Literal["top", "front", "side", "fit"]
-"""From where to look at the whole map; *fit* is the direction from where a browser looks now."""
+Side = Literal["home", "top", "front", "side", "fit"]
+"""From where to look at the map: *home* is the opening view, *fit* the direction in which a browser looks."""
 
 _GROWTH = 1.2
 """The first view is chosen again when the map has grown by this factor."""
@@ -24,15 +24,28 @@ window's width: the panel covers the right side."""
 _ASPECT = 1.6
 """Width over height of a usual window."""
 
-_PANEL_OF_WINDOW, _MARGIN = 0.27, 1.05
+_PANEL_OF_WINDOW, _MARGIN = 0.27, 1.08
 """Share of a usual window's width that the panel covers; and the eye's distance over the least one."""
+
+_STRAY = 0.01
+"""Share of what is seen that a view may leave out beyond each edge of the window: the farthest specks."""
+
+_LEAST_M = 1.0
+"""Least distance of such a view from the middle of what is seen, which may be a single voxel."""
 
 _UPRIGHT = 1e-3
 """The view from the top is so much off the vertical that the front is at the window's lower edge."""
 
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 _WIDE_RAD = np.deg2rad(75.0)
-"""The vertical field of view, but of the picture's view."""
+"""The vertical field of view, but of the picture's view and of views from a side."""
+
+_LONG_RAD = np.deg2rad(5.0)
+"""That of views from a side, which are plans nearly: depth changes the scale by some hundredths."""
+
+_CLIPPED_M = 0.01, 1000.0
+"""viser's own range of distances that are drawn. A plan is seen from far away: its range begins later, or the
+depth buffer would mix up surfaces centimetres apart, but before viser's background, which is 1 m away."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +58,7 @@ class _View:
     up: NDArray[np.float64]
     fov_rad: float = _WIDE_RAD
     whole: bool = False
+    drawn_m: tuple[float, float] = _CLIPPED_M
 
     def within(self, aspect: float) -> "_View":
         """The view in a window of this width over height."""
@@ -109,25 +123,30 @@ class ViewpointController:
             self._begin_there()
             self._follow()
 
-    def look_from(self, client: int, side: Side, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Show one browser the whole box from ``low`` to ``high`` (metres, world) from a side, or from where
-        it looks now; its user has then chosen a view."""
+    def look_from(self, client: int, side: Side, points: NDArray[np.float64]) -> None:
+        """Show one browser nearly all of some points (n, 3), in metres, world, beside the panel: from a side,
+        or from where it looks now, and its user has then chosen a view; or the opening view again."""
         handle = self._server.get_clients().get(client)
         if handle is None:
+            return
+        if side == "home":
+            if self._view is not None:
+                self._point(handle, self._view)
             return
         camera, up = handle.camera, up_vector(self.up)
         front = -np.eye(3)[max(axis for axis in range(3) if axis != self.up[0])]
         sides = {"top": up + _UPRIGHT * front, "front": front, "side": np.cross(up, front)}
         towards = _unit(sides[side] if side in sides else camera.position - camera.look_at)
+        fov_rad = _LONG_RAD if side in sides else camera.fov
         right = _unit(np.cross(up, towards))
-        above = np.cross(towards, right)
-        wide, tall = camera.aspect * np.tan(0.5 * _WIDE_RAD), np.tan(0.5 * _WIDE_RAD)
+        axes = np.stack([right, np.cross(towards, right), towards])
         covered = _PANEL_OF_WINDOW if camera.aspect > 1 else 0.0
-        corners = (np.array(list(np.ndindex(2, 2, 2))) - 0.5) * (high - low)
-        aside = np.maximum(np.abs(corners @ right) / (wide * (1 - covered)), np.abs(corners @ above) / tall)
-        distance = _MARGIN * float((corners @ towards + aside).max())
-        target = (low + high) / 2 + covered * distance * wide * right
-        self._point(handle, _View(target + distance * towards, target, up))
+        eye = fitting_eye(points @ axes.T, camera.aspect, fov_rad, covered)
+        target = np.array([*eye[:2], float(np.median(points @ towards))])
+        distance = max(float(eye[2] - target[2]), _LEAST_M)
+        eye[2] = target[2] + distance
+        drawn_m = (min(distance / 100, 0.5), 100 * distance) if side in sides else (camera.near, camera.far)
+        self._point(handle, _View(eye @ axes, target @ axes, up, fov_rad, drawn_m=drawn_m))
         del self._placed[client]
 
     def look_at_everything(self) -> None:
@@ -207,7 +226,27 @@ class ViewpointController:
             client.camera.position = view.eye_m
             client.camera.look_at = view.target_m
             client.camera.fov = view.fov_rad
+            client.camera.near, client.camera.far = view.drawn_m
         self._placed[client.client_id] = view.eye_m
+
+
+def fitting_eye(
+    points: NDArray[np.float64], aspect: float, fov_rad: float, covered: float
+) -> NDArray[np.float64]:
+    """The nearest eye (3,) that sees nearly all points (n, 3) in a window, looking along -z, with x to the
+    right and y upwards. A panel covers a share of the window's width on its right.
+
+    An edge of slope s shows a point whose x - x_eye is at most s * (z_eye - z): that is, s * z_eye + x_eye is
+    at least x + s * z, of all points but the stray ones; likewise for the other edges."""
+    tall = np.tan(0.5 * fov_rad) / _MARGIN
+    wide, z = aspect * tall, points[:, 2]
+    edges = []
+    for along, right, left in ((points[:, 0], wide * (1 - 2 * covered), wide), (points[:, 1], tall, tall)):
+        high, low = np.quantile([right * z + along, left * z - along], 1 - _STRAY, axis=1)
+        edges.append((high, low, right, left))
+    z_eye = max((high + low) / (right + left) for high, low, right, left in edges)
+    x_y = [0.5 * (high - right * z_eye - low + left * z_eye) for high, low, right, left in edges]
+    return np.array([*x_y, z_eye])
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from taichi_mrf.viewer.scene.coloring import (
     SPACE_COLORS,
     Scale,
     ViewOptions,
+    pale,
     scale_of,
     voxel_colors,
 )
@@ -252,6 +253,7 @@ class VoxelLayer:
         heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
         faces = facing(shown.cells) if look.shade else None
         colors = voxel_colors(look.scale, shown, heights, faces)
+        colors[shown.is_earlier] = pale(colors[shown.is_earlier])
         dynamic = self._is_dynamic(key, shown.cells)
         colors[dynamic] = DYNAMIC_COLOR
         now = _Sent(shown.cells, colors, look.point_size, int(dynamic.sum()))

@@ -24,6 +24,7 @@ _LAYERS = {
     LOG_ODDS: Layer("int16", 1, -32768, "log-odds in LOG_ODDS_STEP; where they are missing nothing is shown"),
     "seen": Layer("uint8", 1, 0, "keyframes whose rays cross the voxel"),
     COLORS: Layer("uint8", 3, NO_COLOR, "red, green, blue that cameras saw"),
+    "earlier": Layer("int16", 1, -32768, "log-odds before today's first keyframe, in an earlier map"),
 }
 """The layers of a map as they are sent to the page."""
 
@@ -35,12 +36,19 @@ _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
 @dataclass(frozen=True)
 class Shown:
     """Voxels of one chunk: ``cells`` (n, 3) uint8 in 0..63, ``log_odds`` (n,) int16 in LOG_ODDS_STEP,
-    ``seen`` (n,) uint8 keyframes, ``colors`` (n, 3) RGB that cameras saw, None if the chunk has none."""
+    ``seen`` (n,) uint8 keyframes, ``colors`` (n, 3) RGB that cameras saw, None if the chunk has none;
+    ``earlier`` (n,) int16 log-odds of the map that a recording has joined, None if it joined none."""
 
     cells: NDArray[np.uint8]
     log_odds: NDArray[np.int16]
     seen: NDArray[np.uint8]
     colors: NDArray[np.uint8] | None = None
+    earlier: NDArray[np.int16] | None = None
+
+    @property
+    def is_earlier(self) -> NDArray[np.bool_]:
+        """The voxels of an earlier map of which today's keyframes have said nothing, (n,)."""
+        return np.zeros(len(self.cells), bool) if self.earlier is None else self.log_odds == self.earlier
 
 
 @dataclass(frozen=True)
@@ -170,6 +178,11 @@ class VoxelStore:
             changed.add(key)
         self._forget_bounds(changed)
         return changed
+
+    def note_earlier(self) -> None:
+        """All that is here now is of an earlier map, which a recording joins."""
+        for chunk in self.chunks.values():
+            chunk.values["earlier"] = chunk.values[LOG_ODDS].copy()
 
     def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
         """The voxel (3,) of the map, as :meth:`.Chunk.voxel` has it."""

@@ -42,11 +42,11 @@ let timer, socket, theme, wasOpen = false, closed = false, hasClosed = false, in
 const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
 const preferred = () => system.matches ? "dark" : "light";
 const numbers = location.hash.match(/^#view=([-+.,\\de]+)$/)?.[1].split(",").map(Number) ?? [];
-const isLink = numbers.length === 9 && numbers.every(Number.isFinite);
+const isLink = [9, 12].includes(numbers.length) && numbers.every(Number.isFinite);
 const linked = isLink ? {
   SetCameraPositionMessage: ["position", numbers.slice(0, 3)],
   SetCameraLookAtMessage: ["look_at", numbers.slice(3, 6)],
-  SetCameraUpDirectionMessage: ["position", numbers.slice(6)],
+  SetCameraUpDirectionMessage: ["position", numbers.slice(6, 9)],
 } : {};
 let view;
 const scheme = () => localStorage.getItem(KEPT) ?? preferred();
@@ -61,6 +61,9 @@ window.Worker = class extends Worker {  // viser's socket lives in one, which te
           const [name, value] = linked[message.type];
           message[name] = value;
           delete linked[message.type];
+          const lens = ["Fov", "Near", "Far"].map((part, i) => [part, numbers[9 + i]]);
+          if (name === "look_at" && numbers.length === 12) lens.forEach(([part, value]) => data.messages.push(
+            {type: `SetCamera${part}Message`, [part.toLowerCase()]: value, initial: false}));
         }
         if (message.type !== "ThemeConfigurationMessage") continue;
         theme = message;
@@ -81,7 +84,8 @@ window.Worker = class extends Worker {  // viser's socket lives in one, which te
 };
 document.addEventListener("click", ({target}) => {
   if (!view || target.closest?.("button")?.textContent !== "LINK") return;
-  const parts = [...view.position, ...view.look_at, ...view.up_direction].map(part => part.toFixed(4));
+  const {position, look_at, up_direction, fov, near, far} = view;
+  const parts = [...position, ...look_at, ...up_direction, fov, near, far].map(part => part.toFixed(4));
   history.replaceState(null, "", "#view=" + parts);
   navigator.clipboard?.writeText(location.href).catch(() => {});
 }, true);
@@ -101,14 +105,16 @@ for (const [event, inner] of [["mouseover", "mouseenter"], ["mouseout", "mousele
   });
 const style = document.createElement("style");
 style.textContent = `
+  [style*="min-width: fit-content"] { padding-inline: 0.3em !important; }  /* five buttons in a row */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
   }
   html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }
-  #cut-off { position: fixed; inset: 0 0 auto; z-index: 100000; padding: 0.6em; text-align: center;
+  #cut-off { position: fixed; inset: 0 25em auto 0; z-index: 100000; padding: 0.6em; text-align: center;
     font: 600 16px sans-serif; color: #fff; background: #c92a2a; pointer-events: none; }
-  html:not([data-cut-off]) #cut-off { display: none; }`;
+  html:not([data-cut-off]) #cut-off { display: none; }
+  @media (max-width: 36em) { #cut-off { right: 0; } }`;
 document.head.append(style);
 const banner = document.createElement("div");
 banner.id = "cut-off";

@@ -1,0 +1,135 @@
+"""Views of the map from the page's buttons: what is seen fills the part of the window beside the panel."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from handled_page import HandledPage
+from live_program import wait_for
+from numpy.typing import NDArray
+from raw_viewer_client import RawClient, camera_message, raw_client
+
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.scene.viewpoint import fitting_eye
+
+HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
+BRICKS = np.array([[x, y, z] for x in range(6) for y in range(4) for z in range(2)], np.int32)
+"""4.8 m x 3.2 m x 1.6 m of occupied voxels."""
+BOX_M = np.array([[0, 0, 0], [4.8, 3.2, 1.6]])
+MIDDLE_M = np.array([2.4, 1.6, 0.8])
+
+
+@pytest.fixture
+def handled() -> Iterator[HandledPage]:
+    running = HandledPage(Page, HELLO)
+    running.page.viewpoint.set_up((2, 1))
+    solid = np.full((len(BRICKS), 512), 900, np.int16), np.ones((len(BRICKS), 512), np.uint8)
+    speck = np.full((1, 512), -900, np.int16)
+    speck[0, 0] = 900  # one voxel, 80 m away
+    running.take(m.Bricks("map", BRICKS, *solid, BRICKS[:0]))
+    running.take(m.Bricks("map", np.array([[0, 100, 0]], np.int32), speck, solid[1][:1], BRICKS[:0]))
+    running.page._flush()
+    yield running
+    running.server.stop()
+
+
+def lens(browser: RawClient) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """The eye, the target, and the field of view that a browser is given."""
+    eye = browser.hear_type("SetCameraPositionMessage", initial=False)["position"]
+    target = browser.hear_type("SetCameraLookAtMessage", initial=False)["look_at"]
+    return np.array(eye), np.array(target), browser.hear_type("SetCameraFovMessage", initial=False)["fov"]
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+@pytest.mark.parametrize(
+    ("side", "across", "upwards", "towards"),
+    [("Top", 0, 1, (0, 0, 1)), ("Front", 0, 2, (0, -1, 0)), ("Side", 1, 2, (1, 0, 0))],
+)
+def test_a_plan_fills_the_window_beside_the_panel(
+    handled: HandledPage,
+    width: int,
+    height: int,
+    side: str,
+    across: int,
+    upwards: int,
+    towards: tuple[int, int, int],
+) -> None:
+    with raw_client(handled.server.get_port()) as browser:
+        browser.say(camera_message(image_width=width, image_height=height))
+        wait_for(lambda: len(handled.server.get_clients()) == 1, "the client")
+        handled.page.actions[side](next(iter(handled.server.get_clients())))
+        eye, target, fov = lens(browser)
+    away = eye - target
+    distance = float(np.linalg.norm(away))
+    assert away / distance == pytest.approx(np.array(towards), abs=2e-3)
+    assert fov < np.deg2rad(10)  # the far side of the box is not much smaller than the near one
+    assert abs(target @ towards - MIDDLE_M @ towards) < 0.1
+    # The window at the box, in metres: the panel covers about 350 of 1280 pixels on the right.
+    tall = 2 * np.tan(fov / 2) * distance
+    wide = tall * width / height
+    covered = 350 / 1280 if width > height else 0.0
+    shown_m = np.array([wide * (1 - covered), tall])
+    size_m = (BOX_M[1] - BOX_M[0])[[across, upwards]]
+    assert 0.85 < (size_m / shown_m).max() < 1.0, "as large as it can be"
+    sideways = np.cross((0, 0, 1) if side != "Top" else (0, 1, 0), towards)
+    beside = (MIDDLE_M - eye) @ sideways
+    assert beside == pytest.approx(-wide * covered / 2, abs=0.02 * wide), "in the middle of what is left"
+
+
+def test_home_is_the_view_that_a_browser_opens_with(handled: HandledPage) -> None:
+    start = handled.server.initial_camera
+    opening = np.array(start.position), np.array(start.look_at), start.fov
+    with raw_client(handled.server.get_port()) as browser:
+        browser.say(camera_message(image_width=1280, image_height=800))
+        wait_for(lambda: len(handled.server.get_clients()) == 1, "the client")
+        client = next(iter(handled.server.get_clients()))
+        handled.page.actions["Top"](client)
+        lens(browser)
+        handled.page.actions["Home"](client)
+        eye, target, fov = lens(browser)
+        camera = handled.server.get_clients()[client].camera
+        assert (camera.near, camera.far) == (0.01, 1000.0)
+    np.testing.assert_allclose(eye, opening[0], atol=1e-6)
+    np.testing.assert_allclose(target, opening[1], atol=1e-6)
+    assert fov == pytest.approx(opening[2])
+
+
+@pytest.mark.parametrize("covered", [0.0, 0.25])
+@pytest.mark.parametrize("fov_deg", [5.0, 75.0])
+def test_the_nearest_eye_that_sees_all_but_the_farthest_specks(covered: float, fov_deg: float) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-3, -1, 0), (5, 1, 2), (20_000, 3))
+    specks = np.array([[900.0, 0.0, 0.0], [0.0, -700.0, 500.0]])
+    fov, aspect = np.deg2rad(fov_deg), 1.5
+    eye = fitting_eye(points, aspect, fov, covered)
+    with_specks = fitting_eye(np.concatenate([points, specks]), aspect, fov, covered)
+    np.testing.assert_allclose(with_specks, eye, rtol=0.01, atol=0.01)
+
+    def places(z_m: float) -> NDArray[np.float64]:
+        """Where the points are seen from there, from -1 to 1 in the window."""
+        x, y, z = (points - (*eye[:2], z_m)).T
+        return np.stack([x / (-z * aspect), y / -z], axis=1) / np.tan(fov / 2)
+
+    seen = places(eye[2])
+    inside = (np.abs(seen[:, 1]) < 1) & (seen[:, 0] > -1) & (seen[:, 0] < 1 - 2 * covered)
+    assert inside.mean() > 0.99
+    low, high = np.quantile(seen[:, 0], [0.005, 0.995])  # across, where these points are long
+    assert high - low == pytest.approx(2 * (1 - covered), rel=0.1)
+    assert high + low == pytest.approx(-2 * covered, abs=0.05)
+
+
+def test_a_single_voxel_can_be_looked_at() -> None:
+    running = HandledPage(Page, HELLO)
+    try:
+        with raw_client(running.server.get_port()) as browser:
+            browser.say(camera_message())
+            wait_for(lambda: len(running.server.get_clients()) == 1, "the client")
+            running.page.viewpoint.look_from(
+                next(iter(running.server.get_clients())), "front", np.ones((1, 3))
+            )
+            eye, target, _ = lens(browser)
+    finally:
+        running.server.stop()
+    assert target[1:] == pytest.approx([1, 1])
+    assert eye[1] < 1.0
