@@ -1,9 +1,10 @@
-"""How fast a planner's queries are: million points a second, beside OctoMap, SciPy and Open3D on the same
-map.
+"""How fast a planner's queries are: million points a second, and the time of a planner's call, beside
+OctoMap, SciPy and Open3D on the same map.
 
 The peers get the map itself, as a file: OctoMap an octree of it, Open3D its voxels as cubes, SciPy the
-states of the box around it. Points lie anywhere in this box, rays begin there in any direction. The first
-call, which compiles kernels, does not count; of those after it the fastest does.
+states of the box around it. Points lie anywhere in this box, rays begin there in any direction; a planner's
+begin where the map is free. The first call, which compiles kernels, does not count; of those after it the
+fastest does.
 """
 
 import importlib.util
@@ -11,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from rich.table import Table
 from scipy.ndimage import distance_transform_edt
 
 from taichi_mrf import (
+    FREE,
     OCCUPIED,
     Config,
     DistanceField,
@@ -36,6 +38,9 @@ from taichi_mrf.system.libraries import library
 POINTS = 1_000_000
 RAYS = 100_000
 RANGE_M = 5.0
+ASKED, FEW = 10_000, 10
+"""Points or rays in a planner's call, and in one whose time is that of the call itself."""
+
 BODIES, BALLS = 1000, 50
 """Configurations of a robot in a call, and the balls that it is made of."""
 
@@ -47,7 +52,10 @@ LARGEST_BOX = 50_000_000
 
 _TRIES = 5
 
+Points: TypeAlias = NDArray[np.float64]
 Asked = Callable[[], object]
+Asking = Callable[[Points, Points], object]
+"""A question about places (n, 3), and about rays that begin there, with their ways (n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,8 @@ class Rate:
 
 @dataclass(frozen=True)
 class QueryRow:
-    """One voxel size. ``rates`` are this package's, ``peers`` the others', by name. ``build`` is how long all
+    """One voxel size. ``rates`` are this package's, ``peers`` the others', by name, and ``calls`` how
+    long a planner's call takes by what it asks, with ASKED of them and with FEW. ``build`` is how long all
     distances of the map take, ``update`` those that one more keyframe changes, ``changed`` voxels;
     ``transform`` is SciPy's for the same box of ``box_voxels``, of obstacles and of all else, None if the box
     is too large; ``field_mb`` is what the field takes."""
@@ -85,6 +94,7 @@ class QueryRow:
     transform: Seconds | None
     box_voxels: int
     peers: dict[str, Rate] = field(default_factory=dict)
+    calls: dict[str, tuple[Seconds, Seconds]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """All figures under their names, with the rates."""
@@ -131,6 +141,15 @@ def bench_queries(
         "distance and gradient": Rate(POINTS, fastest(lambda: distances.distance_and_gradient(points))),
         "balls": Rate(BODIES * BALLS, fastest(lambda: distances.clearance(bodies, radii))),
         "rays": Rate(RAYS, fastest(lambda: cast_rays(m, starts, ways, RANGE_M))),
+        "rays of an image": Rate(
+            last.depth_m.size, fastest(lambda: m.render_depth(last.camera, last.T_world_camera))
+        ),
+    }
+    asked: dict[str, Asking] = {
+        "states": lambda places, ways: m.state(places),
+        "distances": lambda places, ways: distances.distance(places),
+        "rays": lambda places, ways: cast_rays(m, places, ways, RANGE_M),
+        "rays that the unknown stops": lambda places, ways: cast_rays(m, places, ways, RANGE_M, "stop"),
     }
     box_voxels = round(float(np.prod((upper - lower) / m.voxel_size)))
     transform = None
@@ -138,6 +157,13 @@ def bench_queries(
         obstacle = read_box(m, lower, upper).state == OCCUPIED
         transform = timed(lambda: _signed_transform(obstacle))
     peers = _peers(m, points, starts, ways)
+    if "OctoMap" not in missing_peers():
+        box = (lower, upper) if box_voxels <= LARGEST_BOX else None
+        asked |= _octomap_asked(octree_of(m), box, max_distance_m)
+    free = points[m.state(points) == FREE][:ASKED]
+    calls = {
+        name: (_call(asking, free, ways), _call(asking, free[:FEW], ways)) for name, asking in asked.items()
+    }
     id = m.add_keyframe(last.depth_m, last.T_world_camera, last.camera, last.name)
     m.renew([id])
     changed: list[int] = []
@@ -145,7 +171,7 @@ def bench_queries(
     progress(len(frames))
     return QueryRow(
         m.voxel_size, len(frames), rates, build, update, changed[0], distances.bytes / 1e6, transform,
-        box_voxels, peers,
+        box_voxels, peers, calls,
     )  # fmt: skip
 
 
@@ -153,6 +179,10 @@ def fastest(call: Asked, tries: int = _TRIES) -> Seconds:
     """How long the fastest of some calls takes, after one that does not count."""
     call()
     return min((timed(call) for _ in range(tries)), key=lambda seconds: seconds.wall)
+
+
+def _call(asking: Asking, places: Points, ways: Points) -> Seconds:
+    return fastest(lambda: asking(places, ways[: len(places)]), tries=4 * _TRIES)
 
 
 def _extent(m: MRFMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,23 +202,53 @@ def _peers(
 ) -> dict[str, Rate]:
     """Rates of OctoMap and Open3D on the same map, as far as they are installed."""
     missing, rates = missing_peers(), {}
-    with tempfile.TemporaryDirectory() as folder:
-        if "OctoMap" not in missing:
-            export_map(m, Path(folder) / "map.bt", ExportOptions(cells=False))
-            search = _octomap_search(Path(folder) / "map.bt", m.voxel_size, points)
-            rates["OctoMap's search"] = Rate(len(points), fastest(search, tries=2))
-        if "Open3D" not in missing:
+    if "OctoMap" not in missing:
+        tree = octree_of(m)
+        rates["OctoMap's search"] = Rate(len(points), fastest(lambda: tree.getLabels(points), tries=2))
+    if "Open3D" not in missing:
+        with tempfile.TemporaryDirectory() as folder:
             export_map(m, Path(folder) / "map.ply", ExportOptions(cubes=True, cells=False))
             cast = _open3d_rays(Path(folder) / "map.ply", starts, ways)
-            rates["Open3D's rays"] = Rate(len(starts), fastest(cast))
+        rates["Open3D's rays"] = Rate(len(starts), fastest(cast))
     return rates
 
 
-def _octomap_search(path: Path, voxel_size: float, points: NDArray[np.float64]) -> Asked:
-    """Function that asks OctoMap for the states of points, in one call."""
-    tree = library("pyoctomap", "OctoMap's search needs", "bench").OcTree(voxel_size)
-    tree.readBinary(str(path))
-    return lambda: tree.getLabels(points)
+def octree_of(m: MRFMap) -> Any:
+    """OctoMap's tree of the same map."""
+    tree = library("pyoctomap", "OctoMap's queries need", "bench").OcTree(m.voxel_size)
+    with tempfile.TemporaryDirectory() as folder:
+        export_map(m, Path(folder) / "map.bt", ExportOptions(cells=False))
+        tree.readBinary(str(Path(folder) / "map.bt"))
+    return tree
+
+
+def _octomap_asked(
+    tree: Any, box_m: tuple[Points, Points] | None, max_distance_m: float
+) -> dict[str, Asking]:
+    """The same questions to OctoMap. Rays and distances are one call each: it has none for many."""
+    asked: dict[str, Asking] = {
+        "OctoMap's search": lambda places, ways: tree.getLabels(places),
+        "OctoMap's rays": lambda places, ways: octomap_rays(tree, places, ways, stop=False),
+        "OctoMap's rays that the unknown stops": lambda places, ways: octomap_rays(
+            tree, places, ways, stop=True
+        ),
+    }
+    if box_m is not None:
+        tree.dynamicEDT_generate(max_distance_m, *box_m, False)
+        tree.dynamicEDT_update(True)
+        asked["OctoMap's distances"] = lambda places, ways: [
+            tree.dynamicEDT_getDistance(place) for place in places
+        ]
+    return asked
+
+
+def octomap_rays(tree: Any, places: Points, ways: Points, stop: bool) -> list[bool]:
+    """Whether OctoMap's rays meet something within RANGE_M."""
+    end = np.empty(3)
+    return [
+        tree.castRay(place, way, end, ignoreUnknownCells=not stop, maxRange=RANGE_M)
+        for place, way in zip(places, ways, strict=True)
+    ]
 
 
 def _open3d_rays(path: Path, starts: NDArray[np.float64], ways: NDArray[np.float64]) -> Asked:
@@ -209,13 +269,17 @@ def measure_queries(run: BenchRun) -> Measured:
     return query_tables(rows, run.title), [row.to_json() for row in rows], None
 
 
-_QUERY_NAMES = {"balls": "balls, by clearance", "rays": "rays, to what is occupied"}
+_QUERY_NAMES = {
+    "balls": "balls, by clearance",
+    "rays": "rays, to what is occupied",
+    "rays of an image": "rays of an image, by render_depth",
+}
 """Of the rates, those that are called otherwise here."""
 
 
 def query_tables(rows: Sequence[QueryRow], title: str) -> list[Table]:
     """Million queries a second, and the seconds that distances take beside SciPy's transform."""
-    return [_rate_table(rows, title), _distance_table(rows)]
+    return [_rate_table(rows, title), _call_table(rows), _distance_table(rows)]
 
 
 def _rate_table(rows: Sequence[QueryRow], title: str) -> Table:
@@ -232,6 +296,25 @@ def _rate_table(rows: Sequence[QueryRow], title: str) -> Table:
     )
     table.caption_justify = "left"
     return table
+
+
+def _call_table(rows: Sequence[QueryRow]) -> Table:
+    table = size_columns(
+        f"A call of {ASKED:,}, ms of processors' time (of {FEW}: what the call itself takes)",
+        [row.voxel_size for row in rows],
+    )
+    for name in rows[0].calls:
+        table.add_row(name, *[_call_ms(row.calls.get(name)) for row in rows])
+    table.caption = (
+        f"Places where the map is free, rays of up to {RANGE_M:g} m. OctoMap is asked for all states at "
+        "once, for rays and distances one by one, from Python."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _call_ms(call: tuple[Seconds, Seconds] | None) -> str:
+    return "-" if call is None else f"{1e3 * call[0].cpu:.2f} ({1e3 * call[1].cpu:.2f})"
 
 
 def _distance_table(rows: Sequence[QueryRow]) -> Table:

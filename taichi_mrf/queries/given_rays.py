@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F64, I32, AnyArray2, DVec3, F32Array, F32Array2, F64Array, Vec3
-from taichi_mrf.queries.known_bricks import BrickReader, seen_free_bricks
+from taichi_mrf.queries.known_bricks import seen_free_bricks
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window
 
 
@@ -32,20 +32,19 @@ class RaySpace:
     """A map's known and unknown space. It is good for as long as the map does not change."""
 
     def __init__(self, m: VoxelMap) -> None:
-        self.map = m
-        self._reader = BrickReader(m)
-        self._free = seen_free_bricks(m)
-        self._free_keys = grid_keys(self._free)
+        self.map, self._pool = m, m.view.pool
+        self._slots = self._pool.in_use
+        self._bricks, self._free = self._pool.bricks[self._slots], seen_free_bricks(m)
 
     @property
     def unknown_from(self) -> int:
         """Voxels of the index from this number on are those of bricks that no ray has crossed."""
-        return self._reader.pool.capacity * VOXELS
+        return self._pool.capacity * VOXELS
 
     def known_box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Two corners, in metres, around all bricks that are known, and a layer of unknown ones; None if the
         map is empty."""
-        known = np.concatenate([self._reader.bricks, self._free])
+        known = np.concatenate([self._bricks, self._free])
         if not len(known):
             return None
         brick_m = self.map.voxel_size * BRICK
@@ -58,18 +57,17 @@ class RaySpace:
         Raises CapacityError if the box has too many bricks.
         """
         window = Window.covering(lower_m, upper_m, self.map.voxel_size)
-        cells = np.arange(window.cells, dtype=np.int32)
-        bricks = window.bricks_of(cells)
-        slots = self._reader.slots(bricks)
-        unknown = (slots < 0) & ~np.isin(grid_keys(bricks), self._free_keys)
-        slots[unknown] = self._reader.pool.capacity
-        there = slots >= 0
+        slots = np.full(window.cells, self._pool.capacity, np.int32)
+        free, kept = window.cells_of(self._free), window.cells_of(self._bricks)
+        slots[free[free >= 0]] = -1
+        slots[kept[kept >= 0]] = self._slots[kept >= 0]
+        cells = np.flatnonzero(slots >= 0).astype(np.int32)
         index = self.map.view.index
-        index.fill(window, cells[there], slots[there])
+        index.fill(window, cells, slots[cells])
         try:
             yield window
         finally:
-            index.clear(window, cells[there])
+            index.clear(window, cells)
             runtime.settle()
 
 

@@ -23,6 +23,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.blended_field import blended, cell_of
 from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, DistanceField
 from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import voxel_number
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, voxel_in
 from taichi_mrf.voxels.window import Window, WindowIndex
 
@@ -169,9 +170,17 @@ def _distance(space: Template, mean: Template, place: Vec3) -> Vec4:
     corner = ti.floor(place - 0.5)
     share = place - 0.5 - corner
     first = ti.cast(corner, ti.i32)
+    # Where all eight lie in one brick, it is looked up once.
+    number, apart = voxel_in(space, first), (first & 7).max() == 7
     found = Vec4(0.0)
     for x, y, z in ti.static(ti.ndrange(2, 2, 2)):
-        value = _voxel(space, mean, first + IVec3(x, y, z))
+        value, voxel = ti.cast(NONE, ti.f32), number
+        if apart:
+            voxel = voxel_in(space, first + IVec3(x, y, z))
+        elif number >= 0:
+            voxel += voxel_number(IVec3(x, y, z))
+        if voxel >= 0:
+            value = mean[voxel]
         of_x = share[0] if x == 1 else 1.0 - share[0]
         of_y = share[1] if y == 1 else 1.0 - share[1]
         of_z = share[2] if z == 1 else 1.0 - share[2]
@@ -186,12 +195,3 @@ def _distance(space: Template, mean: Template, place: Vec3) -> Vec4:
     if found[0] > 0.1 * NONE:
         found[0] = NONE
     return found
-
-
-@ti.func
-def _voxel(space: Template, mean: Template, voxel: IVec3) -> F32:
-    """The mean distance of one voxel of the window, NONE where there is none."""
-    value, number = NONE, voxel_in(space, voxel)
-    if number >= 0:
-        value = mean[number]
-    return value

@@ -133,16 +133,18 @@ class View:
         volume: VolumeConfig,
         occlusion: Occlusion = _ALL_DIM,
         predicting: Occlusion | None = None,
+        index: WindowIndex | None = None,
     ) -> None:
-        """``predicting`` takes the place of ``occlusion`` where measurements are predicted."""
+        """``predicting`` takes the place of ``occlusion`` where measurements are predicted. ``index`` is that
+        of another view of the map, if it is shared."""
         self.pool, self.voxel_size, self.volume, self.occlusion = pool, voxel_size, volume, occlusion
         self.predicting = occlusion if predicting is None else predicting
-        self.index = WindowIndex()
+        self.index = WindowIndex() if index is None else index
 
     def with_occlusion(self, **changes: float) -> "View":
         """Another view of the same map, in which other voxels let rays through (fields of Occlusion)."""
-        rules = (dataclasses.replace(rule, **changes) for rule in (self.occlusion, self.predicting))
-        return View(self.pool, self.voxel_size, self.volume, *rules)
+        dims, predicts = (dataclasses.replace(rule, **changes) for rule in (self.occlusion, self.predicting))
+        return View(self.pool, self.voxel_size, self.volume, dims, predicts, self.index)
 
     def render_depth(self, camera: Camera, T_world_camera: Pose, max_depth: float) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, NaN where the ray is more likely to pass than to be stopped."""

@@ -104,8 +104,6 @@ class WindowIndex:
     """The dense index itself: one for all windows, filled before use and emptied after it."""
 
     def __init__(self) -> None:
-        self.bricks = ti.ndarray(ti.i32, 1)
-        self.chunks = ti.ndarray(ti.i32, 1)
         self._reset(1)
 
     def _reset(self, cells: int) -> None:

@@ -66,7 +66,9 @@ class MapReading(BrickMap):
         self.promise = source.promise
         self._pool = parts.pool.with_beliefs(belief)
         shown = source.view
-        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)
+        self.view = View(
+            self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting, shown.index
+        )
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:

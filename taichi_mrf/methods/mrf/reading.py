@@ -61,9 +61,7 @@ def decide(m: OccupancyMap, parts: MapParts, between: Callable[[], object] = lam
         return log_odds
 
     # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.
-    reading = MapReading(m, parts, parts.decided.of(parts, found))
-    reading.view.index = m.view.index
-    return reading
+    return MapReading(m, parts, parts.decided.of(parts, found))
 
 
 def calibrated(m: OccupancyMap, parts: MapParts, between: Callable[[], object] = lambda: None) -> MapReading:
