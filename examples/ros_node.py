@@ -17,9 +17,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
 import taichi_mrf as tm
-
-WORLD = "odom"
-DTYPES = {"16UC1": (np.uint16, 0.001), "32FC1": (np.float32, 1.0)}
+from taichi_mrf.datasets.ros import messages
 
 
 class Mapper(Node):
@@ -35,24 +33,15 @@ class Mapper(Node):
         self.camera = tm.PinholeCamera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
 
     def on_depth(self, image: Any) -> None:
-        stamp, (dtype, metres) = image.header.stamp, DTYPES[image.encoding]
-        wait = Duration(seconds=0.1)
+        frame, stamp, wait = image.header.frame_id, Time.from_msg(image.header.stamp), Duration(seconds=0.1)
         try:
-            parts = WORLD, image.header.frame_id, Time.from_msg(stamp), wait
-            moved = self.tf.lookup_transform(*parts).transform
+            T_world_camera = messages.pose_of(self.tf.lookup_transform("odom", frame, stamp, wait))
         except tf2_ros.TransformException as error:
-            self.get_logger().warning(f"no pose: {error}")
-            return
-        q, t, T_world_camera = moved.rotation, moved.translation, np.eye(4)
-        K = np.array([[0, -q.z, q.y], [q.z, 0, -q.x], [-q.y, q.x, 0]])
-        T_world_camera[:3, :3] += 2 * (q.w * K + K @ K)
-        T_world_camera[:3, 3] = t.x, t.y, t.z
+            return self.get_logger().warning(f"no pose: {error}")
         if self.camera is None or np.abs(T_world_camera - self.last).max() < 0.05:
             return  # it stands still
-        rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
-        depth = rows[:, : image.width * np.dtype(dtype).itemsize].copy().view(dtype)
-        depth_m, self.last = depth.astype(np.float32) * np.float32(metres), T_world_camera
-        seconds = stamp.sec + 1e-9 * stamp.nanosec
+        self.last, seconds = T_world_camera, 1e-9 * messages.header_ns(image.header)
+        depth_m = messages.depth_image(image, depth_scale=None)
         key = self.map.add_keyframe(depth_m, T_world_camera, self.camera, stamp_s=seconds)
         self.map.renew([key], seconds=0.2)
         self.page.update()
