@@ -100,7 +100,7 @@ class Extras:
         mapper = self._run.mapper
         if self._baseline is None:
             self._baseline = BaselineOverlay(self._run.source.config, mapper.map.noise)
-            frozen = len(mapper.roster.with_state("frozen"))
+            frozen = mapper.roster.frozen
             if frozen:
                 text = f"the baseline lacks {frozen} frozen keyframes: their images are no longer in memory"
                 self._run.send(Notice(text, "warning"))

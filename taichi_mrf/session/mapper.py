@@ -69,12 +69,28 @@ class LiveKeyframe:
         self.T_recorded = self.T_home = self.T_world_camera
 
 
+FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
+"""The picture of a keyframe whose depth image is no longer in memory."""
+
+MOST_FROZEN = 2000
+"""Frozen keyframes that a run remembers at most, for the camera's path and its times; even."""
+
+
 @dataclass
 class LiveKeyframes:
-    """All keyframes of a run by number, in the order in which they came. A number is never given twice."""
+    """The keyframes of a run by number, in the order in which they came. A number is never given twice.
+
+    ``entries`` holds all that can be changed. Of frozen ones, which ``frozen`` counts, it holds some along
+    the path: a robot runs all day, and what each message costs must not grow.
+    """
 
     entries: dict[int, LiveKeyframe] = field(default_factory=dict)
     next_id: int = 0
+    frozen: int = 0
+
+    def __post_init__(self) -> None:
+        self._frozen: list[int] = []  # of those in entries, in the order in which they were frozen
+        self._every = 1  # of so many frozen keyframes one is kept
 
     def add(
         self,
@@ -92,6 +108,19 @@ class LiveKeyframes:
         self.next_id += 1
         return entry
 
+    def freeze(self, entry: LiveKeyframe) -> None:
+        """Note that a keyframe is frozen."""
+        entry.map_id, entry.state, entry.picture = None, "frozen", FORGOTTEN
+        if self._frozen and (self.frozen - 1) % self._every:  # the last one, kept as the newest so far
+            del self.entries[self._frozen.pop()]
+        self._frozen.append(entry.id)
+        self.frozen += 1
+        if len(self._frozen) > MOST_FROZEN:
+            for id in self._frozen[1::2]:
+                del self.entries[id]
+            del self._frozen[1::2]
+            self._every *= 2
+
     def find(self, id: int) -> LiveKeyframe:
         """A keyframe by the viewer's number. Raises KeyframeError."""
         if id not in self.entries:
@@ -105,9 +134,6 @@ class LiveKeyframes:
 
 RENEW_SECONDS = 0.1
 """Seconds for which keyframes are swept again, at most, before frames and requests are handled."""
-
-FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
-"""The picture of a keyframe whose depth image is no longer in memory."""
 
 
 class Mapper:
@@ -388,8 +414,8 @@ class Mapper:
 
     def _frozen(self, entry: LiveKeyframe, crossed: NDArray[np.int32]) -> messages.KeyframeInfo:
         """Note that the map has frozen a keyframe; returns the last message about it."""
-        picture, entry.picture = entry.picture, FORGOTTEN
-        entry.map_id, entry.state = None, "frozen"
+        picture = entry.picture
+        self.roster.freeze(entry)
         self.edits.forget({entry.id})
         return self._message(entry, picture, crossed)
 

@@ -84,7 +84,7 @@ class Progress:
         if self._measured is None:
             self.measure(mapper)
         assert self._measured is not None
-        states = [entry.state for entry in mapper.roster.entries.values()]
+        on = len(mapper.roster.with_state("on"))
         if replay is not None and not (replay.paused or replay.finished):
             activity += self.time_left(replay)
         return Status(
@@ -92,8 +92,8 @@ class Progress:
             share,
             replay.number if replay else 0,
             replay.frames if replay else 0,
-            states.count("on"),
-            states.count("frozen"),
+            on,
+            mapper.roster.frozen,
             self._rate(self._taken),
             self._measured.voxels,
             self._measured.bricks,

@@ -68,7 +68,7 @@ class ShownSurface:
         if not measures_surface(m):
             raise ConfigError(f"a map of the method {m.config.method} has none")
         if not m.has_surface:
-            frozen = len(self._mapper.roster.with_state("frozen"))
+            frozen = self._mapper.roster.frozen
             text = f"the images of {frozen} frozen keyframes are no longer in memory"
             raise ConfigError(f"{text}; --keep-surface keeps what they say of it")
         found = m.surface(between)
