@@ -6,25 +6,27 @@ yellow; unknown voxels are transparent, so that free and unknown space look diff
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from taichi_mrf.geometry.up import Up
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.geometry.up import Up, up_vector
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, SurfaceView
 from taichi_mrf.viewer.scene.coloring import (
+    COLORINGS,
     DYNAMIC_COLOR,
     SPACE_COLORS,
+    Coloring,
+    Ends,
     Scale,
-    ViewOptions,
     pale,
-    scale_of,
-    voxel_colors,
+    shaded,
 )
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
+from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore, facing
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
 FREE = (*SPACE_COLORS["free"], 110)
@@ -138,12 +140,24 @@ class Look:
 
     log_odds: float
     cut: Cut | None
+    coloring: Coloring
     scale: Scale
+    """That of voxels."""
+    heights_m: Ends = field(compare=False)
+    """The lowest and the highest of the map: what depends on them is in the scale."""
     point_size: float
     """In voxels."""
     shade: bool
-    up: tuple[int, int]
-    """The axis that points up, and 1 or -1 for its direction."""
+    changes: bool
+    up: tuple[float, ...]
+    """A unit vector in the world."""
+
+    def paint(
+        self, shown: Shown, centres_m: NDArray[np.floating], facing: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Colours (n, 3) of voxels with centres (n, 3) in metres, world, whose surfaces face there."""
+        colors = self.scale.paint(shown, centres_m @ self.up)
+        return shaded(colors, facing) if self.shade else colors
 
 
 @dataclass
@@ -249,12 +263,10 @@ class VoxelLayer:
             if before is not None:
                 self._prepared[key] = None
             return
-        axis, sign = look.up
-        heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
-        faces = facing(shown.cells) if look.shade else None
-        colors = voxel_colors(look.scale, shown, heights, faces)
+        centres_m = (np.array(key) * CHUNK_VOXELS + 0.5 + shown.cells) * self._voxel_size
+        colors = look.paint(shown, centres_m, facing(shown.cells))
         colors[shown.is_earlier] = pale(colors[shown.is_earlier])
-        dynamic = self._is_dynamic(key, shown.cells)
+        dynamic = self._is_dynamic(key, shown.cells) & look.changes
         colors[dynamic] = DYNAMIC_COLOR
         now = _Sent(shown.cells, colors, look.point_size, int(dynamic.sum()))
         if before is not None and np.array_equal(before.cells, now.cells):
@@ -302,28 +314,34 @@ class VoxelLayer:
         return self.origin_m + (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
 
 
-def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
-    """How the voxels of a map look."""
+def look_of(
+    options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float, view: SurfaceView | None = None
+) -> Look:
+    """How the voxels of a map look. Heights run over the range of the ``view`` of the surface, if there is
+    one."""
+    log_odds = float(np.log(options.threshold / (1 - options.threshold)))
+    coloring = COLORINGS[options.color_by]
+    some, centres = store.sample(log_odds)
+    towards = up_vector(up) if view is None else view.up
+    their_heights_m = voxel_size * centres @ towards
+    if view is None:
+        heights_m = _whole_bricks(their_heights_m, BRICK * voxel_size)
+    else:
+        heights_m = view.floor_m, view.floor_m + view.range_m
     return Look(
-        log_odds=float(np.log(options.threshold / (1 - options.threshold))),
+        log_odds=log_odds,
         cut=cut_of(options, store, up, voxel_size),
-        scale=scale_of(
-            options.color_by,
-            options.threshold,
-            _heights_m(store, up, voxel_size),
-            store.most_seen() if options.color_by == "keyframes" else 1,
-        ),
+        coloring=coloring,
+        scale=coloring.voxels.scale(coloring.voxels.of(some, their_heights_m), heights_m),
+        heights_m=heights_m,
         point_size=options.size,
         shade=options.shade,
-        up=up,
+        changes=options.changes,
+        up=tuple(towards.tolist()),
     )
 
 
-def _heights_m(store: VoxelStore, up: Up, voxel_size: float) -> tuple[float, float]:
-    """Heights of the lower side of the lowest brick and of the upper side of the highest, in metres."""
-    bounds = store.bounds()
-    if bounds is None:
-        return 0.0, 1.0
-    axis, sign = up
-    ends = sign * BRICK * voxel_size * np.array([bounds[0][axis], bounds[1][axis] + 1])
-    return float(ends.min()), float(ends.max())
+def _whole_bricks(heights_m: NDArray[np.float64], brick_m: float) -> Ends:
+    """The lowest and the highest of some heights; stray ones do not count."""
+    floor_m, top_m = np.quantile(heights_m, [0.005, 0.995]) if len(heights_m) else (0.0, brick_m)
+    return float(np.floor(floor_m / brick_m)) * brick_m, float(np.ceil(top_m / brick_m)) * brick_m
