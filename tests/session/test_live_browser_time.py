@@ -64,6 +64,7 @@ def said_dynamic(page: LivePage) -> int:
 def test_what_moves_is_red_and_what_changed_has_boxes(page: LivePage, saved: MRFMap) -> None:
     dynamic = voxels_of(saved.dynamic)
     assert dynamic > 50
+    page.tab("Map")
     page.until(lambda seen: "/changes" in seen.nodes, "boxes around what appeared and left")
     page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
     page.screenshot("walker_dynamic")

@@ -222,7 +222,6 @@ def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: Live
     offered = handled.page.panel.view_options.handles["color_by"]
     assert "keyframes that see it" in offered.options
     assert "photo" not in offered.options
-    assert "height: height above the lowest surface." in offered.hint
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
     assert "keyframes that see it" not in offered.options
     assert "photo" in offered.options

@@ -280,9 +280,10 @@ def test_an_entry_of_the_table_is_a_colouring_of_the_page(monkeypatch: pytest.Mo
     try:
         widget = running.page.panel.view_options.handles["color_by"]
         assert "place" in widget.options
-        assert "place: where in its chunk." in widget.hint
+        widget.value = "place"
         running.draw(color_by="place", draw_as="voxels", shade=False)
         assert running.asked[-1] == m.Watch(False, None, False, counts=True)
+        assert widget.hint.endswith("where in its chunk.")
         (sent,) = running.page.map.layers["map"]._sent.values()
         # The voxels are at 0 to 7 in the chunk.
         np.testing.assert_array_equal(sent.colors[:, 0], np.rint(255.0 * sent.cells[:, 2] / 7))

@@ -163,12 +163,13 @@ class BasePanel:
 
     def offer(self, hello: Hello) -> None:
         """Offer the layers and colours that a map has the data for."""
-        colorings, drawings = colorings_of(hello), drawings_of(hello)
-        self.view_options.offer("color_by", colorings, [COLORINGS[name].help for name in colorings])
-        self.view_options.offer("draw_as", drawings)
+        self.view_options.offer("color_by", colorings_of(hello))
+        self.view_options.offer("draw_as", drawings_of(hello))
 
     def show_used(self, **used: bool) -> None:
-        """Show the widgets of these view options while they have an effect."""
+        """Show the widgets of these view options while they have an effect; explain the chosen colours."""
+        colors = self.view_options.handles["color_by"]
+        change(colors, hint=f"The map's colours say {COLORINGS[colors.value].help}")
         for name in used.keys() & self.view_options.handles.keys():
             change(self.view_options.handles[name], visible=used[name])
 

@@ -50,9 +50,10 @@ _DARKENED = (0.75, 0.62, 1.0)
 """Brightness of surfaces perpendicular to x, y and z."""
 
 _ACROSS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
-_SHADES = np.where(
+_BRIGHT = np.where(
     _ACROSS.any(axis=1), _ACROSS @ _DARKENED / np.maximum(_ACROSS.sum(axis=1), 1), sum(_DARKENED) / 3
 )
+_SHADES = np.rint(256 * _BRIGHT).astype(np.uint16)
 
 
 @cache
@@ -125,7 +126,7 @@ class Scale:
         numbers = self.measure.of(known, heights_m)
         if not len(self.colors):
             return numbers
-        low, high = self.low, self.high
+        numbers, low, high = numbers.astype(np.float32), self.low, self.high
         if self.measure.logarithmic:
             numbers, low, high = np.log(np.maximum(numbers, low)), np.log(low), np.log(high)
         share = (numbers - low) / max(high - low, 1e-6)
@@ -192,7 +193,7 @@ _PHOTO = Measure("what cameras saw; grey where none did", _seen_colors)
 _PLAIN = Measure("", lambda known, heights_m: np.full((len(heights_m), 3), _GREY, np.uint8))
 
 COLORINGS: dict[str, Coloring] = {
-    "height": Coloring("height above the lowest surface.", _HEIGHT, _HEIGHT),
+    "height": Coloring("how high it is above its lowest surface.", _HEIGHT, _HEIGHT),
     "marginal probability": Coloring(
         "how sure the map is that a voxel is occupied: orange where it is unsure, blue where it is sure.",
         voxels=Measure(
@@ -204,7 +205,7 @@ COLORINGS: dict[str, Coloring] = {
         ),
     ),
     "uncertainty": Coloring(
-        "of a voxel the entropy of its probability, of the surface its standard deviation.",
+        "how unsure it is: the entropy of a voxel, or the standard deviation of the surface.",
         voxels=Measure(
             "uncertainty: entropy (bits)", _entropy, lambda low, high: ramp("magma", 50), logarithmic=True
         ),
@@ -215,7 +216,7 @@ COLORINGS: dict[str, Coloring] = {
             logarithmic=True,
         ),
     ),
-    "photo": Coloring("the colours that cameras saw.", _PHOTO, _PHOTO, needs="colors"),
+    "photo": Coloring("what colours cameras saw.", _PHOTO, _PHOTO, needs="colors"),
     "keyframes that see it": Coloring(
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
@@ -227,14 +228,14 @@ COLORINGS: dict[str, Coloring] = {
         ),
         needs="counts",
     ),
-    "plain grey": Coloring("nothing: what moves and what changed stands out.", _PLAIN, _PLAIN),
+    "plain grey": Coloring("nothing, so that what moves and what changed stands out.", _PLAIN, _PLAIN),
 }
 """All colourings by name; the first is that of a new page."""
 
 
 def shaded(colors: NDArray[np.uint8], facing: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Colours (n, 3), darkened by the direction that the surface at each voxel is ``facing``."""
-    return (colors * _SHADES[facing][:, None] + 0.5).astype(np.uint8)
+    return (colors * _SHADES[facing][:, None] + 128 >> 8).astype(np.uint8)
 
 
 def pale(color: ArrayLike) -> NDArray[np.uint8]:

@@ -27,7 +27,7 @@ class ViewOptions:
     place."""
 
     color_by: str = next(iter(COLORINGS))
-    """What the colours of the map say:"""
+    """What the colours of the map say."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5
     """Show voxels whose probability of being occupied is at least this."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, SurfaceView
@@ -153,10 +153,13 @@ class Look:
     """A unit vector in the world."""
 
     def paint(
-        self, shown: Shown, centres_m: NDArray[np.floating], facing: NDArray[np.uint8]
+        self, shown: Shown, centres: NDArray, voxel_size: float, first_m: ArrayLike, facing: NDArray[np.uint8]
     ) -> NDArray[np.uint8]:
-        """Colours (n, 3) of voxels with centres (n, 3) in metres, world, whose surfaces face there."""
-        colors = self.scale.paint(shown, centres_m @ self.up)
+        """Colours (n, 3) of voxels whose surfaces face there, with centres (n, 3) in voxels from ``first_m``
+        (metres, world)."""
+        up_m = voxel_size * np.array(self.up, np.float32)
+        heights_m = centres.astype(np.float32) @ up_m + np.float32(np.dot(first_m, self.up))
+        colors = self.scale.paint(shown, heights_m)
         return shaded(colors, facing) if self.shade else colors
 
 
@@ -263,8 +266,8 @@ class VoxelLayer:
             if before is not None:
                 self._prepared[key] = None
             return
-        centres_m = (np.array(key) * CHUNK_VOXELS + 0.5 + shown.cells) * self._voxel_size
-        colors = look.paint(shown, centres_m, facing(shown.cells))
+        first_m = (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
+        colors = look.paint(shown, shown.cells, self._voxel_size, first_m, facing(shown.cells))
         colors[shown.is_earlier] = pale(colors[shown.is_earlier])
         dynamic = self._is_dynamic(key, shown.cells) & look.changes
         colors[dynamic] = DYNAMIC_COLOR

@@ -69,12 +69,9 @@ class OptionWidgets(Generic[T]):
             handle.on_update(lambda event: self._changed())
             self.handles[name] = handle
 
-    def offer(self, name: str, choices: Sequence[str], helps: Sequence[str] = ()) -> None:
-        """Let a dropdown offer these choices only, and say what each is."""
+    def offer(self, name: str, choices: Sequence[str]) -> None:
+        """Let a dropdown offer these choices only."""
         change(self.handles[name], options=tuple(choices))
-        if helps:
-            texts = (f"{choice}: {text}" for choice, text in zip(choices, helps, strict=True))
-            change(self.handles[name], hint=" ".join([field_help(type(self._options))[name], *texts]))
 
     def value(self) -> T:
         """The options with the values of the widgets."""
