@@ -121,6 +121,11 @@ def test_stray_voxels_do_not_stretch_the_range_of_heights() -> None:
     store.put(np.array([[0, 0, 7]], np.int32), log_odds=speck)
     scale = look_of(ViewOptions(), store, (2, 1), 0.1).scale
     assert (scale.low, scale.high) == pytest.approx((0.0, 0.8))
+    turned = VoxelStore()
+    for brick in flat[::-1]:
+        turned.put(brick[None], log_odds=np.full((1, 512), 900, np.int16))
+    turned.put(np.array([[0, 0, 7]], np.int32), log_odds=speck)
+    np.testing.assert_array_equal(turned.sample(0.0)[1], store.sample(0.0)[1])  # whatever order they came in
 
 
 def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:

@@ -228,6 +228,8 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     photo = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [90, 90, 90]], np.uint8)
     drawn.take(patch(photo))
     drawn.take(VIEW)
+    high, occupied = np.array([[0, 0, 3]], np.int32), np.full((1, 512), 900, np.int16)
+    drawn.take(m.Bricks("map", high, occupied, np.ones((1, 512), np.uint8), high[:0]))
     drawn.draw(color_by="photo", shade=False)
     assert np.abs(drawn.mesh()[2].astype(int) - photo).max() <= 1
     drawn.draw(color_by="uncertainty", shade=False)
@@ -240,10 +242,10 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     drawn.draw(shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
-    assert (scale.low, scale.high) == (1.0, 3.0)
-    assert re.findall("<span>(.*?)</span>", legend_html(scale)) == ["0", scale.measure.label, "2"]
+    assert (scale.low, scale.high) == pytest.approx((0.0, 3.2))  # of the voxels: four bricks
+    assert re.findall("<span>(.*?)</span>", legend_html(scale)) == ["0", scale.measure.label, "3.2"]
     lit = drawn.mesh()[2].astype(int)
-    assert np.abs(lit - scale.colors[[0, 0, 128, 0]]).max() <= 1
+    assert np.abs(lit - scale.colors[[80, 80, 159, 80]]).max() <= 1  # 1 and 2 of 3.2 m
     drawn.draw()
     assert np.abs(drawn.mesh()[2] - lit * (0.62 + 0.38 * 0.8)).max() <= 2
 

@@ -229,7 +229,7 @@ class MapScene:
         as_first = (options.draw_as, options.color_by) == (first.draw_as, first.color_by)
         if as_first and not (self.surface.is_complete and not self.growing):
             options = replace(options, color_by=GROWING)
-        look = look_of(options, self.store, up, self.hello.voxel_size, self.surface.view)
+        look = look_of(options, self.store, up, self.hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
         map_changed = everything or bool(self.layers["map"].changed)

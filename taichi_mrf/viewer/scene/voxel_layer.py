@@ -14,7 +14,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.geometry.up import Up, up_vector
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, SurfaceView
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.coloring import (
     COLORINGS,
     DYNAMIC_COLOR,
@@ -317,20 +317,14 @@ class VoxelLayer:
         return self.origin_m + (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
 
 
-def look_of(
-    options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float, view: SurfaceView | None = None
-) -> Look:
-    """How the voxels of a map look. Heights run over the range of the ``view`` of the surface, if there is
-    one."""
+def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
+    """How the voxels of a map look; heights of the surface have the same range."""
     log_odds = float(np.log(options.threshold / (1 - options.threshold)))
     coloring = COLORINGS[options.color_by]
     some, centres = store.sample(log_odds)
-    towards = up_vector(up) if view is None else view.up
+    towards = up_vector(up)
     their_heights_m = voxel_size * centres @ towards
-    if view is None:
-        heights_m = _whole_bricks(their_heights_m, BRICK * voxel_size)
-    else:
-        heights_m = view.floor_m, view.floor_m + view.range_m
+    heights_m = _ends(their_heights_m, 2 * voxel_size)
     return Look(
         log_odds=log_odds,
         cut=cut_of(options, store, up, voxel_size),
@@ -344,7 +338,7 @@ def look_of(
     )
 
 
-def _whole_bricks(heights_m: NDArray[np.float64], brick_m: float) -> Ends:
-    """The lowest and the highest of some heights; stray ones do not count."""
-    floor_m, top_m = np.quantile(heights_m, [0.005, 0.995]) if len(heights_m) else (0.0, brick_m)
-    return float(np.floor(floor_m / brick_m)) * brick_m, float(np.ceil(top_m / brick_m)) * brick_m
+def _ends(heights_m: NDArray[np.float64], step_m: float) -> Ends:
+    """The lowest and the highest of some heights, in whole steps; stray ones do not count."""
+    floor_m, top_m = np.quantile(heights_m, [0.005, 0.995]) if len(heights_m) else (0.0, step_m)
+    return float(np.floor(floor_m / step_m)) * step_m, float(np.ceil(top_m / step_m)) * step_m

@@ -138,12 +138,14 @@ class Chunk:
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
 
-    def at_least(self, log_odds: float, cut: Cut | None = None, step: int = 1) -> Shown:
-        """The voxels of at least these log-odds that are not cut away, of all bricks or each ``step``-th; the
-        ``cut`` counts from the chunk."""
-        every = {name: each[::step].reshape(-1, *each.shape[2:]) for name, each in self.values.items()}
+    def at_least(
+        self, log_odds: float, cut: Cut | None = None, rows: slice | NDArray[np.intp] = slice(None)
+    ) -> Shown:
+        """The voxels of at least these log-odds that are not cut away, of all bricks or some ``rows`` of them;
+        the ``cut`` counts from the chunk."""
+        every = {name: each[rows].reshape(-1, *each.shape[2:]) for name, each in self.values.items()}
         voxels = np.flatnonzero(every[LOG_ODDS] >= np.ceil(log_odds / LOG_ODDS_STEP))
-        codes = self._codes[::step].astype(np.int32)
+        codes = self._codes[rows].astype(np.int32)
         cells = _CELLS[codes[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
         if cut is not None:
             kept = cut.keeps(cells[:, cut.axis] + 0.5)
@@ -161,8 +163,9 @@ class Chunk:
         return Shown(cells.astype(np.uint8), **found)
 
     def sample(self, log_odds: float) -> Shown:
-        """Some voxels of at least these log-odds, from all over the chunk."""
-        shown = self.at_least(log_odds, step=_step(len(self), _SAMPLED_BRICKS))
+        """Some voxels of at least these log-odds, from all over the chunk; the same in whatever order its
+        bricks came."""
+        shown = self.at_least(log_odds, rows=np.argsort(self._codes)[:: _step(len(self), _SAMPLED_BRICKS)])
         return shown[:: _step(len(shown.cells), _SAMPLED)]
 
     def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
