@@ -36,8 +36,6 @@ VIEW = m.SurfaceView(
     up=np.array([0.0, 0.0, 1.0]),
     light=np.array([0.6, -0.8, 0.0]),
     fov_rad=0.6,
-    floor_m=1.0,
-    range_m=2.0,
     photo=False,
 )
 CHUNK = (0, -1, 0)

@@ -30,6 +30,9 @@ _FROM_FILM = np.array(
 )
 _EXPOSURE = 1 / 0.6
 
+_NEARLY_SAME = 0.999
+"""Cosine between the upward directions of two views: less, and the light comes from elsewhere."""
+
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
 
@@ -82,7 +85,7 @@ class SurfaceLayer:
     def take_view(self, view: SurfaceView) -> None:
         """Take in how to show the patches that were taken in before. One that differs little from the last
         changes nothing, so that an edit draws only what it changes."""
-        if self.view is None or not _is_like(self.view, view):
+        if self.view is None or float(self.view.up @ view.up) < _NEARLY_SAME:
             self.view = view
             self.outdate(self.patches.keys())
 
@@ -175,12 +178,6 @@ class SurfaceLayer:
 
     def _corner_m(self, key: ChunkKey) -> NDArray[np.float64]:
         return np.array(key) * (CHUNK_VOXELS * self._voxel_size)
-
-
-def _is_like(view: SurfaceView, other: SurfaceView) -> bool:
-    """True if colours by height are nearly the same."""
-    one, two = (np.array([each.floor_m, each.floor_m + each.range_m]) for each in (view, other))
-    return bool((np.abs(one - two) < 0.02 * view.range_m).all()) and float(view.up @ other.up) > 0.999
 
 
 def unlit_glb(

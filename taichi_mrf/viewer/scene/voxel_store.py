@@ -141,7 +141,7 @@ class Chunk:
     def at_least(
         self, log_odds: float, cut: Cut | None = None, rows: slice | NDArray[np.intp] = slice(None)
     ) -> Shown:
-        """The voxels of at least these log-odds that are not cut away, of all bricks or some ``rows`` of them;
+        """The voxels of at least these log-odds that are not cut away, of all bricks or those in ``rows``;
         the ``cut`` counts from the chunk."""
         every = {name: each[rows].reshape(-1, *each.shape[2:]) for name, each in self.values.items()}
         voxels = np.flatnonzero(every[LOG_ODDS] >= np.ceil(log_odds / LOG_ODDS_STEP))
