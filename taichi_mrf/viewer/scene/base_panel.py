@@ -146,8 +146,8 @@ class BasePanel:
             if triangles is None
             else f"{triangles:,} triangles of the measured surface"
         )
-        text += " shown"
-        text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts.get(name))
+        others = (f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts.get(name))
+        text += "".join([" shown", *others])
         text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
         self._shown.content = text + (" · recording" if recording else "")
 

@@ -7,8 +7,8 @@ from the numbers that are there, and shows its help.
 
 import base64
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import cv2
@@ -43,17 +43,14 @@ CHANCES: dict[str, tuple[float, tuple[int, int, int]]] = {
 }
 """Chances that a voxel is occupied, as log-odds, and their colours; those between are blended."""
 
-_GREY = 150
 _MOST_RATIO = 1000.0
 """Between the ends of a logarithmic scale."""
 _DARKENED = (0.75, 0.62, 1.0)
 """Brightness of surfaces perpendicular to x, y and z."""
 
 _ACROSS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
-_BRIGHT = np.where(
-    _ACROSS.any(axis=1), _ACROSS @ _DARKENED / np.maximum(_ACROSS.sum(axis=1), 1), sum(_DARKENED) / 3
-)
-_SHADES = np.rint(256 * _BRIGHT).astype(np.uint16)
+_MEAN = _ACROSS @ _DARKENED / np.maximum(_ACROSS.sum(axis=1), 1)
+_SHADES = np.rint(256 * np.where(_ACROSS.any(axis=1), _MEAN, sum(_DARKENED) / 3)).astype(np.uint16)
 
 
 @cache
@@ -93,7 +90,7 @@ class Measure:
     colors: Callable[[float, float], NDArray[np.uint8]] | None = None
     ends: Callable[[Floats, Ends], Ends] = spread
     logarithmic: bool = False
-    marks: Callable[[float, float], tuple[str, ...]] | None = None
+    marks: Callable[[float, float], tuple[str, ...]] = lambda low, high: ()
 
     def scale(self, some: NDArray, heights_m: Ends) -> "Scale":
         """The scale on which ``some`` of the numbers lie, in a map between two heights."""
@@ -113,13 +110,12 @@ class Scale:
     measure: Measure
     low: float
     high: float
-    colors: NDArray[np.uint8] = field(init=False, compare=False)
-    """The colours from the low to the high end, (256, 3); none if the measure gives colours."""
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def colors(self) -> NDArray[np.uint8]:
+        """The colours from the low to the high end, (256, 3); none if the measure gives colours."""
         made = self.measure.colors
-        colors = np.zeros((0, 3), np.uint8) if made is None else made(self.low, self.high)
-        object.__setattr__(self, "colors", colors)
+        return np.zeros((0, 3), np.uint8) if made is None else made(self.low, self.high)
 
     def paint(self, known: Any, heights_m: Floats) -> NDArray[np.uint8]:
         """Colours (n, 3) of voxels or vertices."""
@@ -131,11 +127,6 @@ class Scale:
             numbers, low, high = np.log(np.maximum(numbers, low)), np.log(low), np.log(high)
         share = (numbers - low) / max(high - low, 1e-6)
         return self.colors[np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)]
-
-    @property
-    def marks(self) -> tuple[str, ...]:
-        """Words at even distances from the low to the high end; none if the ends are numbers."""
-        return () if self.measure.marks is None else self.measure.marks(self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -190,7 +181,7 @@ _HEIGHT = Measure(
     marks=lambda low, high: ("0", _HEIGHT_LABEL, f"{high - low:.3g}"),
 )
 _PHOTO = Measure("what cameras saw; grey where none did", _seen_colors)
-_PLAIN = Measure("", lambda known, heights_m: np.full((len(heights_m), 3), _GREY, np.uint8))
+_PLAIN = Measure("", lambda known, heights_m: np.full((len(heights_m), 3), NO_COLOR, np.uint8))
 
 COLORINGS: dict[str, Coloring] = {
     "height": Coloring("how high it is above its lowest surface.", _HEIGHT, _HEIGHT),
@@ -249,7 +240,8 @@ def legend_html(scale: Scale) -> str:
     if not len(scale.colors):
         return f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
     strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
-    named = scale.marks or (f"{scale.low:.3g}", label, f"{scale.high:.3g}")
+    ends = f"{scale.low:.3g}", label, f"{scale.high:.3g}"
+    named = scale.measure.marks(scale.low, scale.high) or ends
     below = "" if label in named else f'<div style="text-align:center">{label}</div>'
     png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
     return (
@@ -267,9 +259,8 @@ def key_html(space: bool, changes: bool) -> str:
     if changes:
         named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
-    together = "display:inline-block"
     spans = "".join(
-        f'<div style="{together}"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
+        f'<div style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
     unknown = " · unknown: nothing" if space else ""

@@ -322,8 +322,7 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
     log_odds = float(np.log(options.threshold / (1 - options.threshold)))
     coloring = COLORINGS[options.color_by]
     some, centres = store.sample(log_odds)
-    towards = up_vector(up)
-    their_heights_m = voxel_size * centres @ towards
+    their_heights_m = voxel_size * centres @ up_vector(up)
     heights_m = _ends(their_heights_m, 2 * voxel_size)
     return Look(
         log_odds=log_odds,
@@ -334,7 +333,7 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
         point_size=options.size,
         shade=options.shade,
         changes=options.changes,
-        up=tuple(towards.tolist()),
+        up=tuple(up_vector(up).tolist()),
     )
 
 
