@@ -17,7 +17,6 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import OF_BELIEFS
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, change, in_html, in_markdown
 from taichi_mrf.viewer.tune import messages as t
@@ -33,10 +32,6 @@ class KnobMoved(Event):
 
 
 NONE_YET = "none yet"
-MAP_OPTIONS = (
-    "look", "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "ground",
-    "axes", "pictures",
-)  # fmt: skip
 
 _OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
 _FOLDERS = {"map": "Map", **_OWN, "keyframes": "Keyframes"}
@@ -80,8 +75,7 @@ class TunePanel(BasePanel):
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self.add_buttons("Look from", [side.capitalize() for side in get_args(Side)])
             self.add_legend()
-            self.view_options.add(*MAP_OPTIONS)
-            self.view_options.offer("look", OF_BELIEFS)
+            self.add_layers("changes", "points", "baseline", "follow")
             self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
