@@ -236,6 +236,16 @@ class Rules:
     whole_clearly: float = 0.15
     """Fit by which the place has to exceed any other."""
 
+    whole_colored: int = 500
+    """Points of which both the map and the images have colours, for these to count."""
+
+    whole_color_worth: float = 0.3
+    """Worth of a place's colours, for a correlation of 1 of their brightness with the map's: wrong places
+    have .4, right ones .9."""
+
+    whole_alike: float = 0.5
+    """Correlation that they need to have."""
+
     whole_sigma_m: float = 0.005
     """Sigma of the alignment of a stretch with a map, along the direction that it determines best, metres:
     the map's keyframes and the recording's poses are wrong by so much among themselves."""

@@ -4,7 +4,7 @@ A stretch of ten frames, by their own poses one scan, is tried at every place ne
 under every heading (wide_search). What fits best is aligned from coarse to fine, fewer poses at each level.
 A place counts only if the surface of the stretch lies on that of the map, its images do not look through
 what the map has there, hardly any of it lies where the map is free, its points determine all six directions,
-and no other place fits nearly as well.
+its colours are those of the map, if both have any, and no other place fits nearly as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from taichi_mrf.alignment.levels import LEAST_POINTS, grids_of
 from taichi_mrf.alignment.levenberg import align, determined
 from taichi_mrf.alignment.locate import agreement
 from taichi_mrf.alignment.locate_around import FoundPose, distinct
-from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
+from taichi_mrf.alignment.oriented_points import STRIDE, OrientedPoints, oriented_points
 from taichi_mrf.alignment.point_to_plane import PointToPlane
 from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
 from taichi_mrf.alignment.rules import RULES
@@ -53,7 +53,8 @@ class LocatedRecording:
     ``covariance`` (6, 6) is that of the twist (rho, omega) of the middle camera of the ``frames``, in its
     frame. ``overlap`` is the share of what the frames see that lies near the map, ``agreement`` the share of
     that which lies on it, ``through`` the share of the map that they would look through, and ``in_free`` the
-    share of what they see that would lie where the map is free.
+    share of what they see that would lie where the map is free. ``colors`` is the correlation of their
+    brightness with that of the map, NaN unless both have colours.
     """
 
     T_map_recording: Pose | None
@@ -63,6 +64,7 @@ class LocatedRecording:
     agreement: float = 0.0
     through: float = 0.0
     in_free: float = 0.0
+    colors: float = np.nan
     places: tuple[Pose, ...] = ()
     frames: tuple[str, ...] = ()
 
@@ -93,6 +95,7 @@ class LocatedRecording:
             "agreement": self.agreement,
             "looked_through": self.through,
             "in_free_space": self.in_free,
+            "colors": None if np.isnan(self.colors) else self.colors,
             "frames": list(self.frames),
             "says": self.in_words(),
         }
@@ -103,13 +106,15 @@ class WholeMap:
     """What a map shows of its world: its ``surface``, the ``walls`` that several of its keyframes have
     measured, which nothing can look through, the places ``cameras_m`` (N, 3) of its keyframes, and ``up``
     (3,), upwards in its world to 45 degrees. ``is_free`` tells of points (N, 3), in metres, which lie in free
-    space, (N,). ``most_through`` is the share of the walls that a camera's images may look through."""
+    space, (N,), and ``colors`` their colours (N, 4) with weights. ``most_through`` is the share of the walls
+    that a camera's images may look through."""
 
     surface: Surfels
     walls: Planes
     cameras_m: NDArray[np.float64]
     up: NDArray[np.float64]
     is_free: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+    colors: Callable[[NDArray[np.float64]], NDArray[np.uint8]] | None = None
     most_through: float = RULES.whole_through
 
     @cached_property
@@ -165,8 +170,9 @@ def map_of_voxels(m: VoxelMap) -> WholeMap:
     places_m = lower_m + RULES.grid_widest_m * np.argwhere(np.ones(number))
     walls = walls_of(surface, [surface, surface])
     return WholeMap(
-        surface, walls, places_m[is_free(places_m)], up_vector(up), is_free, RULES.whole_voxels_through
-    )
+        surface, walls, places_m[is_free(places_m)], up_vector(up), is_free,
+        m.colors if m.has_colors else None, RULES.whole_voxels_through,
+    )  # fmt: skip
 
 
 def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
@@ -182,21 +188,28 @@ class Stretch:
     """Some frames of a recording as one scan, in the frame of the middle one's camera."""
 
     def __init__(
-        self, images: Sequence[DepthImage], T_recording_camera: Sequence[Pose], max_depth: float
+        self,
+        images: Sequence[DepthImage],
+        T_recording_camera: Sequence[Pose],
+        max_depth: float,
+        colors: Sequence[NDArray[np.uint8] | None] = (),
     ) -> None:
         """``images`` with their poses (4, 4) in the recording's world; points up to ``max_depth`` metres
-        count."""
+        count. ``colors`` (H, W, 3) are the images' own, if they have any."""
         self.T_recording_scan = T_recording_camera[len(images) // 2]
         T_scan_recording = inverse(self.T_recording_scan)
         self.T_scan_camera = [T_scan_recording @ T for T in T_recording_camera]
         self.images = images
         ups = [T[:3, :3] @ image.camera.up for image, T in zip(images, self.T_scan_camera, strict=True)]
         self.up = np.mean(ups, axis=0)
-        self.points = _one_scan(
-            [oriented_points(image, max_depth) for image in images],
-            self.T_scan_camera,
-            RULES.whole_points // len(images),
-        )
+        of_each = RULES.whole_points // len(images)
+        parts = [oriented_points(image, max_depth).about(of_each) for image in images]
+        self.points = _one_scan(parts, self.T_scan_camera)
+        self._brightness: NDArray[np.float64] | None = None
+        if colors and all(color is not None for color in colors):
+            pairs = zip(parts, colors, strict=True)
+            seen = [color[tuple(STRIDE * part.places.T[::-1])] for part, color in pairs if color is not None]
+            self._brightness = _brightness(np.concatenate(seen))
         self.around = sees_around(images[0].camera)
         self._sights = [Sightlines.of(image) for image in images] if self.around else []
 
@@ -209,6 +222,19 @@ class Stretch:
         """The points (N, 3), in metres in the map, from a pose (4, 4)."""
         return self.points.points.astype(np.float64) @ T_map_scan[:3, :3].T + T_map_scan[:3, 3]
 
+    def alike(self, whole: WholeMap, T_map_scan: Pose) -> float:
+        """Correlation of the points' brightness with that of a map where they lie from a pose (4, 4); NaN
+        unless both have enough colours."""
+        if self._brightness is None or whole.colors is None:
+            return float("nan")
+        there = whole.colors(self.points_from(T_map_scan))
+        both = (there[:, 3] > 0) & np.isfinite(self._brightness)
+        if both.sum() < RULES.whole_colored:
+            return float("nan")
+        seen, mapped = self._brightness[both], _brightness(there[both, :3])
+        spread = float(seen.std() * mapped.std())  # none where all is of one brightness
+        return float(np.cov(seen, mapped, bias=True)[0, 1]) / spread if spread > 0 else float("nan")
+
     def looks_through(self, surface: Planes, T_map_scan: Pose) -> float:
         """The share of a mapped surface that the images look through from a pose (4, 4), in the mean."""
         poses = [T_map_scan @ T for T in self.T_scan_camera]
@@ -220,17 +246,22 @@ class Stretch:
         return float(np.mean(shares))
 
 
-def _one_scan(parts: Sequence[OrientedPoints], poses: Sequence[Pose], of_each: int) -> OrientedPoints:
-    """Points of several images in one frame, about ``of_each`` of every image."""
-    thin = [part.about(of_each) for part in parts]
-    pairs = list(zip(thin, poses, strict=True))
+def _brightness(colors: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """The brightness (N,) of colours (N, 3); NaN of black ones, which no camera saw."""
+    weights = np.array([0.299, 0.587, 0.114])
+    return np.asarray(np.where(colors.any(axis=1), colors @ weights, np.nan))
+
+
+def _one_scan(parts: Sequence[OrientedPoints], poses: Sequence[Pose]) -> OrientedPoints:
+    """Points of several images in one frame."""
+    pairs = list(zip(parts, poses, strict=True))
     points = [part.points @ T[:3, :3].T + T[:3, 3] for part, T in pairs]
     normals = [part.normals @ T[:3, :3].T for part, T in pairs]
     return OrientedPoints(
         np.concatenate(points).astype(np.float32),
         np.concatenate(normals).astype(np.float32),
-        np.concatenate([part.sigmas for part in thin]),
-        np.concatenate([part.places for part in thin]),
+        np.concatenate([part.sigmas for part in parts]),
+        np.concatenate([part.places for part in parts]),
     )
 
 
@@ -297,8 +328,12 @@ def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
 
 
 def _judged(stretch: Stretch, whole: WholeMap, places: Sequence[FoundPose]) -> LocatedRecording:
-    """Verdict on the best of several places."""
-    best, *others = places
+    """Verdict on the best of several places, whose worth colours raise."""
+    colors = [stretch.alike(whole, place.end.T_world_camera) for place in places]
+    gains = RULES.whole_color_worth * np.nan_to_num(colors)
+    rated = [replace(each, worth=each.worth + gain) for each, gain in zip(places, gains, strict=True)]
+    order = sorted(range(len(rated)), key=lambda i: -rated[i].worth)
+    best, *others = (rated[i] for i in order)
     equations, T_scan_recording = best.end.equations, inverse(stretch.T_recording_scan)
     seen = LocatedRecording(
         None,
@@ -306,6 +341,7 @@ def _judged(stretch: Stretch, whole: WholeMap, places: Sequence[FoundPose]) -> L
         agreement=agreement(equations),
         through=best.through,
         in_free=best.in_free,
+        colors=colors[order[0]],
     )
     most = RULES.whole_scan_through if stretch.around else whole.most_through
     reason = _objection(seen, best, most, RULES.whole_scan_in_free if stretch.around else RULES.whole_in_free)
@@ -339,6 +375,8 @@ def _objection(seen: LocatedRecording, best: FoundPose, through: float, in_free:
         return f"{where} it would look through {seen.through:.0%} of what is mapped"
     if seen.in_free > in_free:
         return f"{where} {seen.in_free:.0%} of what is seen lies where the map is free"
+    if seen.colors < RULES.whole_alike:
+        return f"{where} its colours are not those of the map (correlation {seen.colors:.1f})"
     if best.end.directions < 6:
         return f"too little seen: it determines {best.end.directions} of the six directions of its place"
     return ""

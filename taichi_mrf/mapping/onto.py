@@ -103,7 +103,8 @@ def locate(
     whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
     for part in _stretches(m, frames, {} if kept is None else kept, tell):
         images = [_image(m, frame) for frame in part]
-        stretch = Stretch(images, [frame.T_world_camera for frame in part], m.sensor.max_depth)
+        poses, colors = [frame.T_world_camera for frame in part], [frame.color for frame in part]
+        stretch = Stretch(images, poses, m.sensor.max_depth, colors)
         names = tuple(frame.name for frame in part)
         now = replace(locate_stretch(stretch, whole, T_map_recording), frames=names)
         if now.T_map_recording is not None:
@@ -126,8 +127,9 @@ def whole_map(m: MRFMap) -> WholeMap:
     walls = walls_of(surface, [m.aligner.surface.of([id]) for id in m.keyframes])
     cameras_m = np.stack([keyframe.T_world_camera[:3, 3] for keyframe in m.keyframes.values()])
     return WholeMap(
-        surface, walls, cameras_m, up_vector(m.up), lambda points: m.marginals.state(points) == FREE
-    )
+        surface, walls, cameras_m, up_vector(m.up), lambda points: m.marginals.state(points) == FREE,
+        m.colors if m.has_colors else None,
+    )  # fmt: skip
 
 
 def _stretches(

@@ -1,6 +1,7 @@
 """A recording is found in a whole map, or refused: another place, too little seen, or two that look alike."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 NOISE = PolynomialNoise((SIGMA_M,))
 
 
-def map_of(frames: Sequence[Frame]) -> MRFMap:
-    m = MRFMap.from_config(CONFIG, CAMERA)
+def map_of(frames: Sequence[Frame], color: bool = False) -> MRFMap:
+    m = MRFMap.from_config(replace(CONFIG, color=color), CAMERA)
     for frame in frames:
         m.add(frame)
     m.infer()
@@ -46,7 +47,18 @@ def shot(scene: Scene, poses: Sequence[Pose]) -> list[Frame]:
 
 def stretch_of(frames: Sequence[Frame], T_away: Pose) -> Stretch:
     images = [DepthImage.upload(frame.depth_m, CAMERA, NOISE) for frame in frames]
-    return Stretch(images, [T_away @ frame.T_world_camera for frame in frames], 10.0)
+    poses, colors = [T_away @ frame.T_world_camera for frame in frames], [frame.color for frame in frames]
+    return Stretch(images, poses, 10.0, colors)
+
+
+def painted(frames: Sequence[Frame], brightness: Callable[[np.ndarray], np.ndarray]) -> list[Frame]:
+    """Frames that see walls as bright (0 to 1) as their points (..., 3) in the world are."""
+    found = []
+    for frame in frames:
+        R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
+        bright = brightness((CAMERA.rays() * frame.depth_m[..., None]) @ R.T + t)
+        found.append(replace(frame, color=np.repeat((50 + 200 * bright).astype(np.uint8)[..., None], 3, -1)))
+    return found
 
 
 def located(m: MRFMap, frames: Sequence[Frame], T_away: Pose) -> LocatedRecording:
@@ -150,6 +162,34 @@ def test_an_empty_room_looks_alike_from_two_sides() -> None:
     found = located(m, frames, T_away)
     assert found.T_map_recording is not None, found.reason
     assert tangent_norms(found.T_map_recording @ T_away, np.eye(4))[1] < 0.03
+
+
+def test_colours_tell_two_sides_of_an_empty_room_apart() -> None:
+    scene, one_wall_bright = box_room(5.0, 3.4), lambda points: np.where(points[..., 0] > 1.0, 1.0, 0.3)
+    yesterday_s, today_s = shot(scene, around(12)), shot(scene, around(8, 0.4))
+    today, T_away = painted(today_s, one_wall_bright), turned_away()
+    m = map_of(painted(yesterday_s, one_wall_bright), color=True)
+    found = located(m, today, T_away)
+    assert found.T_map_recording is not None, found.reason
+    assert tangent_norms(found.T_map_recording @ T_away, np.eye(4)) < (0.03, 0.03)
+    assert found.colors > 0.9
+    # Unless both have them, they count for nothing.
+    for frames, of in ((today_s, m), (today, map_of(yesterday_s))):
+        found = located(of, frames, T_away)
+        assert found.reason.startswith("two places look alike")
+        assert found.to_json()["colors"] is None
+
+
+def test_a_room_of_the_same_shape_in_other_colours_is_refused() -> None:
+    scene = box_room(5.0, 3.4, Solid("box", (2.0, 0.6, -0.8), (0.3, 0.6, 0.4)))
+    m = map_of(painted(shot(scene, around(12)), lambda points: (points[..., 2] > 0) * 1.0), color=True)
+    today = shot(scene, around(8, 0.4))
+    found = located(m, painted(today, lambda points: (points[..., 2] < 0) * 1.0), turned_away())
+    assert found.T_map_recording is None
+    assert "its colours are not those of the map (correlation -" in found.reason
+    # A lamp that is dimmed changes no mind.
+    dim = painted(today, lambda points: 0.2 + 0.2 * (points[..., 2] > 0))
+    assert located(m, dim, turned_away()).T_map_recording is not None
 
 
 def test_in_a_hall_a_stretch_is_found_further_from_the_cameras() -> None:
