@@ -40,7 +40,7 @@ def walking(page: LivePage) -> list[Image.Image]:
     """One picture for each keyframe while the person is there."""
     close_warning(page)
     page.until(lambda seen: len(seen.keyframes) >= FIRST_KEYFRAMES - 2, "most of the room")
-    page.select("Look", "changes")
+    page.select("Color by", "plain grey")
     page.page.mouse.move(0.37 * WIDTH, 0.52 * HEIGHT)
     page.page.mouse.wheel(0, CLOSER)
     shots: list[Image.Image] = []

@@ -37,6 +37,7 @@ def shot(page: LivePage) -> Image.Image:
 def level_cut(page: LivePage, share: float) -> None:
     """Cut the map at this share of its height."""
     page.select("Cut axis", "z")
+    page.tick("Free space")
     slider = page.input("Cut at (m)").get_by_role("slider")
     low_m, high_m = (float(slider.get_attribute(f"aria-value{end}") or 0) for end in ("min", "max"))
     page.slide("Cut at (m)", round(low_m + share * (high_m - low_m), 2))
@@ -56,10 +57,10 @@ def live_cut(page: LivePage) -> Image.Image:
 def live_surface(page: LivePage) -> Image.Image:
     """The measured surface by height, without the widgets."""
     page.tab("Map")
-    page.select("Look", "surface by height")
+    page.show("surface", "height")
     page.until(lambda seen: seen.settled and seen.triangles, "the surface")
     picture = shot(page).crop((0, 150, 940, 770)).resize((480, 317), Image.Resampling.LANCZOS)
-    page.select("Look", "voxels by probability")
+    page.show("voxels", "marginal probability")
     page.until_settled()
     return picture
 
@@ -67,7 +68,7 @@ def live_surface(page: LivePage) -> Image.Image:
 def live_lidar(page: LivePage) -> Image.Image:
     """A building by lidar without its roof, from nearer, without the widgets."""
     page.tab("Map")
-    page.select("Look", "voxels by height")
+    page.show("voxels", "height")
     level_cut(page, 0.45)
     page.until_settled()
     page.page.mouse.move(480, 430)
@@ -80,7 +81,7 @@ def live_lidar(page: LivePage) -> Image.Image:
 def live_keyframes(page: LivePage) -> Image.Image:
     """A keyframe with the gizmo that moves it, the map coloured by the number of keyframes."""
     page.tab("Map")
-    page.select("Look", "voxels by keyframes")
+    page.show("voxels", "keyframes that see it")
     page.tab("Keyframes")
     page.select("Keyframe", re.compile("room-0009"))
     page.press("Move")
@@ -88,7 +89,7 @@ def live_keyframes(page: LivePage) -> Image.Image:
     picture = shot(page)
     page.press("Move")
     page.tab("Map")
-    page.select("Look", "voxels by probability")
+    page.show("voxels", "marginal probability")
     page.until_settled()
     return picture
 
@@ -111,14 +112,14 @@ def live_baseline(page: LivePage) -> Image.Image:
     """The map of OctoMap's update from the same keyframes, on the other side of a cut."""
     page.tab("Map")
     page.select("Cut axis", "x")
-    page.tick("Show baseline")
+    page.tick("Baseline")
     page.until(lambda seen: seen.baseline, "the other map")
     counts: list[int] = []
     while len(counts) < 2 or counts[-1] != counts[-2]:  # it grows for as long as keyframes come
         page.pause(STEADY_S)
         counts.append(page.until(lambda seen: seen.settled, "the other map").baseline)
     picture = shot(page)
-    page.tick("Show baseline", on=False)
+    page.tick("Baseline", on=False)
     page.select("Cut axis", "none")
     page.until(lambda seen: seen.settled and not seen.baseline, "one map")
     return picture

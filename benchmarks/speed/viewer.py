@@ -25,8 +25,8 @@ from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.publish import Publisher
 from taichi_mrf.viewer.messages import Bricks, Hello
-from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.map_scene import MapScene
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport.server import start_server
 
 _QUIET_S = 0.3

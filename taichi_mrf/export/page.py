@@ -17,7 +17,8 @@ from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import LookName, ViewOptions, probabilities, voxel_colors
+from taichi_mrf.viewer.scene.coloring import probabilities
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, look_of
 from taichi_mrf.viewer.scene.voxel_store import Chunk, Shown, VoxelStore, facing
@@ -43,7 +44,6 @@ def write_page(
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
     map's), by their marginals or in the colours of ``colored``, the same map; with ``cells`` also the cells
     that stand in for voxels (queries/cells.py). Raises MapFileError, ViewerError."""
-    look_name: LookName = "voxels by probability" if colored is None else "voxels in photo colours"
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
@@ -59,7 +59,8 @@ def write_page(
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
-            options = ViewOptions(look_name, threshold)
+            by = "marginal probability" if colored is None else "photo"
+            options = ViewOptions(color_by=by, threshold=threshold)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
             layer.prepare(look, everything=True, exactly=True)
             layer.send()
@@ -76,19 +77,17 @@ def add_cells(
     scene: viser.SceneApi, store: VoxelStore, look: Look, voxel_size: float, evidence: float
 ) -> None:
     """Add the cells of a map, below /cells. Voxels of at most ``evidence`` log-odds do not count."""
-    axis, sign = look.up
     for key, chunk in store.chunks.items():
         first_m = (np.array(key) * CHUNK_VOXELS + 0.5) * voxel_size  # the centre of the first voxel
         for side, shown in standing_cells(chunk, look.log_odds, evidence):
             if not len(shown.cells):
                 continue
             centres = shown.cells + 0.5 * (side - 1)
-            heights_m = sign * (first_m[axis] + centres[:, axis] * voxel_size)
-            faces = facing(shown.cells // side, CHUNK_VOXELS // side) if look.shade else None
+            faces = facing(shown.cells // side, CHUNK_VOXELS // side)
             scene.add_point_cloud(
                 f"/cells/{key[0]}_{key[1]}_{key[2]}_{side}",
                 points=centres.astype(np.float16),
-                colors=voxel_colors(look.scale, shown, heights_m, faces),
+                colors=look.paint(shown, centres, voxel_size, first_m, faces),
                 point_size=side * look.point_size,
                 point_shape="square",
                 precision="float16",

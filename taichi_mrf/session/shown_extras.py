@@ -20,7 +20,7 @@ from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.pictures.room_views import PHOTO_VOXEL_M, DrawnSurface, smooth_borders
 from taichi_mrf.evaluation.pictures.surfaces import up_direction, upward_axis
-from taichi_mrf.evaluation.pictures.viewpoint import LIGHT, PERSPECTIVE, height_span, overview_pose
+from taichi_mrf.evaluation.pictures.viewpoint import LIGHT, PERSPECTIVE, overview_pose
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.inference.schedule import Progress
@@ -135,7 +135,6 @@ def _view(surface: DrawnSurface, m: MRFMap) -> SurfaceView:
         up,
         R @ LIGHT,
         2.0 * float(np.arctan(0.5 * PERSPECTIVE.height / PERSPECTIVE.fy)),
-        *height_span(vertices_m @ up, m.voxel_size),
         photo=surface.colors is not None and m.voxel_size <= PHOTO_VOXEL_M,
     )
 

@@ -123,8 +123,7 @@ class SurfaceView(Update):
     """All patches of the measured surface are sent; this is how the picture of a run shows it.
 
     ``eye_m`` and ``target_m`` are in metres, world; ``up`` and ``light``, towards the light, are unit vectors
-    there; ``fov_rad`` is the vertical field of view. Heights, along ``up``, are coloured from ``floor_m``
-    over ``range_m``, unless the picture is a ``photo``, in the colours that cameras saw.
+    there; ``fov_rad`` is the vertical field of view. A ``photo`` is in the colours that cameras saw.
     """
 
     eye_m: NDArray[np.float64]
@@ -132,8 +131,6 @@ class SurfaceView(Update):
     up: NDArray[np.float64]
     light: NDArray[np.float64]
     fov_rad: float
-    floor_m: float
-    range_m: float
     photo: bool
 
 

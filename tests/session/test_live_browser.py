@@ -149,17 +149,17 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
     for mode, legend in [
-        ("probability", "chance that a voxel is occupied"),
+        ("marginal probability", "chance that a voxel is occupied"),
         ("uncertainty", "bits"),
-        ("keyframes", "see the voxel"),
+        ("keyframes that see it", "see the voxel"),
     ]:
-        page.select("Look", f"voxels by {mode}")
+        page.select("Color by", mode)
         seen = page.until(lambda seen: seen.colors not in known and seen.agrees, f"colours by {mode}")
         page.until(lambda seen, legend=legend: legend in page.text(), f"the scale of {mode}")
-        page.screenshot(f"colours_{mode}")
+        page.screenshot(f"colours_{mode.replace(' ', '_')}")
         known.add(seen.colors)
         assert seen.voxels == first.voxels
-    page.select("Look", "voxels by height")
+    page.select("Color by", "height")
     page.until(lambda seen: seen.colors == first.colors, "the first colours")
 
 
@@ -168,6 +168,8 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
     assert "/cut" not in before.nodes
     page.select("Cut axis", "z")
     half = page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
+    assert "/cut" not in page.look().nodes
+    page.tick("Free space")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
     page.screenshot("cut_z")
     page.slide("Cut at (m)", -0.7)
@@ -186,7 +188,7 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
 
 
 def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) -> None:
-    page.select("Look", "surface by height")
+    page.select("Draw as", "surface")
     expected = len(saved.surface().triangles)
     seen = page.until(lambda seen: seen.agrees and seen.triangles == expected, "the surface")
     assert seen.voxels == 0
@@ -196,31 +198,52 @@ def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) ->
     x, y, _ = page.free_places(corner[:20])[0]
     page.click(x, y)
     page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
-    page.select("Look", "voxels by height")
+    assert not page.input("Threshold").is_visible()  # it does nothing for a surface
+    page.select("Draw as", "voxels")
     page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "voxels again")
 
 
 def test_free_space_and_measured_points(page: LivePage, saved: MRFMap) -> None:
     before = page.look()
-    page.select("Look", "free and unknown space")
+    page.tick("Free space")
     page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
     page.until(lambda seen: "unknown: nothing" in page.text(), "the key to its colours")
     assert page.input("Cut axis").input_value() == "z"
     page.screenshot("free_space")
+    page.tick("Free space", on=False)
+    page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "the whole map")
     page.tab("Keyframes")
     page.select("Keyframe", re.compile("^2: "))
-    page.select("Look", "measured points of the keyframe")
+    page.tab("Map")
+    page.tick("Points")
     depth_m = saved.keyframes[2].depth_m
-    said = f"{(depth_m > 0).sum():,} measured points shown"
+    said = f"{(depth_m > 0).sum():,} measured points"
     page.until(lambda seen: said in page.text() and "/measured" in seen.nodes, "its points")
     assert len(page.places("/measured", "points")) == (depth_m > 0).sum()
-    assert "/voxels" not in page.look().nodes
+    assert page.look().voxels == before.voxels
     page.screenshot("measured_points")
-    page.tab("Map")
-    page.select("Look", "voxels by height")
-    page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "the voxels")
-    assert "/measured" not in page.look().nodes
+    page.tick("Points", on=False)
+    page.until(lambda seen: "/measured" not in seen.nodes, "no points")
+
+
+def test_each_layer_goes_and_comes_by_itself(page: LivePage) -> None:
+    before = page.look()
+    for label, gone in (
+        ("Map", lambda name: name.startswith("/voxels")),
+        ("Path", lambda name: name in ("/way", "/camera")),
+        ("Keyframes", lambda name: name.startswith("/keyframes")),
+    ):
+        page.tick(label, on=False)
+        left = [name for name in before.nodes if not gone(name)]
+        seen = page.until(lambda seen, left=left: seen.agrees and sorted(seen.nodes) == left, f"no {label}")
+        assert len(seen.nodes) < len(before.nodes)
+        page.tick(label)
+        page.until(lambda seen: seen.agrees and seen.nodes == before.nodes, label)
+    page.tick("Pictures", on=False)
+    page.until(lambda seen: not page.places("/keyframes/", "picture"), "no pictures")
+    page.tick("Pictures")
+    page.until(lambda seen: page.places("/keyframes/", "picture"), "the pictures")
 
 
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
@@ -372,11 +395,11 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     page.page.mouse.wheel(0, -300)  # a viewpoint of the user's own
     page.pause(1.0)
     before, eye = page.look(), page.position()
-    page.tick("Show baseline")
+    page.tick("Baseline")
     seen = page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")
     assert seen.voxels == before.voxels
     page.screenshot("baseline")
-    page.tick("Show baseline", on=False)
+    page.tick("Baseline", on=False)
     page.until(lambda seen: seen.agrees and seen.said_baseline == 0, "the map alone")
     np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
@@ -389,7 +412,7 @@ def test_a_map_with_colours_has_a_baseline_without(browser: "Browser") -> None:
         LivePage(browser, program.address) as page,
     ):
         page.until_settled()
-        page.tick("Show baseline")
+        page.tick("Baseline")
         page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")
         page.screenshot("baseline_of_colours")
         assert page.problems == []
@@ -432,7 +455,7 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
 ) -> None:
     before = page.look()
     with LivePage(browser, program.address, width=400, height=700) as narrow:
-        assert not narrow.input("Look").is_visible()  # the panel is folded at first
+        assert not narrow.input("Draw as").is_visible()  # the panel is folded at first
         narrow.until(lambda seen: seen.voxels == before.voxels, "the voxels")
         places = np.array(narrow.places("/voxels/", "points"))[:, :2]
         assert ((places > 0) & (places < (400, 700))).all()
@@ -440,7 +463,7 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         assert narrow.until_settled().voxels == before.voxels
         narrow.screenshot("narrow")
         assert narrow.page.evaluate("() => document.documentElement.scrollWidth") <= 400
-        for label in ("Threshold", "Look", "Size"):
+        for label in ("Threshold", "Draw as", "Size"):
             widget = narrow.input(label)
             widget.scroll_into_view_if_needed()
             box = widget.bounding_box()
@@ -471,7 +494,7 @@ def test_nothing_is_cut_off(
 ) -> None:
     with LivePage(browser, program.address, width, height) as page:
         page.page.emulate_media(color_scheme=scheme)
-        if not page.input("Look").is_visible():
+        if not page.input("Draw as").is_visible():
             page.page.get_by_text("taichi_mrf: ").click()
         page.until_settled()
         for tab in ("Map", "Keyframes", "Ray", "Images", "Save", "About"):

@@ -319,7 +319,8 @@ def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None
 
 
 def test_reset_begins_anew_and_ends_the_same(page: LivePage) -> None:
-    page.select("Look", "voxels by height")  # a surface has no voxels to count
+    page.tab("Map")
+    page.select("Draw as", "voxels")  # a surface has no voxels to count
     before = at_rest(page)
     page.select("Speed", "0.25x")  # or a machine that draws slowly sees only the end
     page.press("Reset")

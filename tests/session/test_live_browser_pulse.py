@@ -105,8 +105,8 @@ def until_reconnected(page: LivePage, list_before: str | None, voxels: int) -> N
 
 
 def list_id(page: LivePage) -> str | None:
-    """Of the list of looks; another viewer gives it another one."""
-    return page.input("Look").get_attribute("id")
+    """Of a dropdown; another viewer gives it another one."""
+    return page.input("Draw as").get_attribute("id")
 
 
 def viewer_of(program: LiveProgram) -> int:

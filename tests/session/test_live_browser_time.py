@@ -61,16 +61,18 @@ def said_dynamic(page: LivePage) -> int:
     return int(found[1].replace(",", "")) if found else 0
 
 
-def test_what_moves_is_red_and_has_boxes_in_the_look_of_changes(page: LivePage, saved: MRFMap) -> None:
+def test_what_moves_is_red_and_what_changed_has_boxes(page: LivePage, saved: MRFMap) -> None:
     dynamic = voxels_of(saved.dynamic)
     assert dynamic > 50
-    page.select("Look", "changes")
+    page.tab("Map")
     page.until(lambda seen: "/changes" in seen.nodes, "boxes around what appeared and left")
     page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
     page.screenshot("walker_dynamic")
-    page.select("Look", "voxels by height")
+    page.tick("Changes", on=False)
     page.until(lambda seen: seen.agrees and "/changes" not in seen.nodes, "no boxes")
-    assert red(page) == said_dynamic(page) == dynamic
+    page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == 0, "nothing red")
+    page.tick("Changes")
+    page.until(lambda seen: seen.agrees and red(page) == dynamic and "/changes" in seen.nodes, "all again")
 
 
 def test_the_list_names_what_appeared(page: LivePage) -> None:

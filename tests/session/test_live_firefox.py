@@ -1,4 +1,4 @@
-"""The live page in Firefox: its first view, and the points of a look that is chosen there."""
+"""The live page in Firefox: its first view, and the points of a drawing that is chosen there."""
 
 from pathlib import Path
 
@@ -45,7 +45,8 @@ def test_firefox_shows_the_first_view_and_points(tmp_path: Path) -> None:
 
         until("triangles")
         first = in_color(firefox, "firefox_first_view")
-        firefox.select("Look", "voxels by probability")
+        firefox.select("Draw as", "voxels")
+        firefox.select("Color by", "marginal probability")
         until("voxels")
         voxels = in_color(firefox, "firefox_voxels")
         assert firefox.problems == []

@@ -234,7 +234,7 @@ class LivePage:
         """Wait until the map is at rest, and show its voxels."""
         self.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "a settled map")
         self.tab("Map")
-        self.select("Look", "voxels by height")
+        self.show("voxels", "height")
         return self.until(lambda seen: seen.settled and seen.voxels, "the voxels of a settled map")
 
     def pause(self, seconds: float) -> None:
@@ -255,7 +255,8 @@ class LivePage:
 
     def input(self, label: str) -> "Locator":
         """The element of the widget with this label, looked for anew each time it is used."""
-        return self.page.locator(f'xpath=//*[@id = //label[normalize-space(.) = "{label}"]/@for]')
+        text = "normalize-space(translate(., '\N{EM SPACE}', ' '))"  # some are indented
+        return self.page.locator(f'xpath=//*[@id = //label[{text} = "{label}"]/@for]')
 
     def fill(self, label: str, *numbers: float) -> None:
         """Type numbers into the boxes of a vector, from the first one on."""
@@ -275,6 +276,11 @@ class LivePage:
         """Choose from a dropdown: the option with this text, or the one that a pattern is found in."""
         self.input(label).click()
         self.page.get_by_role("option", name=option, exact=True).click()
+
+    def show(self, drawn_as: str, color_by: str) -> None:
+        """Choose how the map is drawn and what its colours say, in the tab Map."""
+        self.select("Draw as", drawn_as)
+        self.select("Color by", color_by)
 
     def tick(self, label: str, on: bool = True) -> None:
         """Set or clear a checkbox."""

@@ -77,7 +77,8 @@ class Firefox:
 
     def select(self, label: str, option: str) -> None:
         """Choose from a dropdown."""
-        self._click(f'//*[@id = //label[normalize-space(.) = "{label}"]/@for]')
+        text = "normalize-space(translate(., '\N{EM SPACE}', ' '))"  # some are indented
+        self._click(f'//*[@id = //label[{text} = "{label}"]/@for]')
         self._click(f'//*[@role = "option"][normalize-space(.) = "{option}"]')
 
     def screenshot(self, name: str) -> Path:

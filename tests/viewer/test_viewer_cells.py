@@ -8,7 +8,7 @@ import pytest
 
 from taichi_mrf.export.page import add_cells
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 
@@ -77,9 +77,9 @@ def test_a_cell_is_as_large_as_the_surface_is_uncertain(
 
 def test_a_cell_has_the_colour_of_its_own_probability() -> None:
     store = store_of(wall(2, -0.5))
-    (color,) = set(boxes(store, look="voxels by probability").values())
+    (color,) = set(boxes(store, color_by="marginal probability").values())
     p = 2 / (1 + np.exp(0.5))
-    scale = look_of(ViewOptions("voxels by probability"), store, (2, 1), VOXEL).scale
+    scale = look_of(ViewOptions(color_by="marginal probability"), store, (2, 1), VOXEL).scale
     expected = scale.colors[round(255 * np.log(p / (1 - p)) / np.log(999))]
     assert np.abs(np.array(color, int) - expected).max() <= 3
 
@@ -89,4 +89,4 @@ def test_a_cell_has_the_mean_of_the_colours_that_were_seen_in_it() -> None:
     colors = np.full((1, 512, 3), 128, np.uint8)
     colors[0, :10], colors[0, 10:20] = (10, 20, 30), (30, 20, 50)
     store.put(BRICK, colors=colors)
-    assert set(boxes(store, look="voxels in photo colours").values()) == {(20, 20, 40)}
+    assert set(boxes(store, color_by="photo").values()) == {(20, 20, 40)}

@@ -16,13 +16,7 @@ from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import (
-    ColorBy,
-    ViewOptions,
-    legend_html,
-    scale_of,
-    voxel_colors,
-)
+from taichi_mrf.viewer.scene.coloring import COLORINGS, Scale, legend_html, shaded
 from taichi_mrf.viewer.scene.keyframe_layer import (
     FRUSTUM_M,
     RING_M,
@@ -32,6 +26,7 @@ from taichi_mrf.viewer.scene.keyframe_layer import (
     placement,
 )
 from taichi_mrf.viewer.scene.ray_plot import curves
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import look_of
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
 from taichi_mrf.voxels.colors import NO_COLOR
@@ -48,84 +43,116 @@ def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
     )
 
 
+def scale_of(name: str, *some: Shown, heights_m: tuple[float, float] = HEIGHTS) -> Scale:
+    """The scale of a colouring for a map that has these voxels, all at height 0."""
+    measure = COLORINGS[name].voxels
+    numbers = [measure.of(each, np.zeros(len(each.cells))) for each in some]
+    return measure.scale(np.concatenate(numbers or [np.zeros(0)]), heights_m)
+
+
+LIKELY, UNLIKELY = shown(np.array([0.0, 5.0])), shown(np.array([-1.0, 5.0]))
+
+
 def test_chances_have_their_colours_and_those_between_are_blended() -> None:
     chances = {0.5: (240, 110, 40), 0.9: (247, 190, 95), 0.99: (150, 200, 180), 0.999: (60, 140, 190)}
     p = np.array(list(chances))
-    scale = scale_of("probability", 0.5, HEIGHTS)
-    colors = voxel_colors(scale, shown(np.log(p / (1 - p))), np.zeros(4)).astype(int)
+    scale = scale_of("marginal probability", LIKELY)
+    colors = scale.paint(shown(np.log(p / (1 - p))), np.zeros(4)).astype(int)
     # 256 colours, and the log-odds are rounded to 1/512.
     assert np.abs(colors - list(chances.values())).max() <= 2
-    between = voxel_colors(scale, shown(np.array([1.0986])), np.zeros(1)).astype(int)  # 3 in 4
+    between = scale.paint(shown(np.array([1.0986])), np.zeros(1)).astype(int)  # 3 in 4
     assert np.abs(between - (colors[0] + colors[1]) / 2).max() <= 2
-    unlikely = scale_of("probability", 0.2, HEIGHTS)
-    assert np.abs(voxel_colors(unlikely, shown(np.zeros(1)), np.zeros(1)).astype(int) - colors[0]).max() <= 2
+    unlikely = scale_of("marginal probability", UNLIKELY)
+    assert np.abs(unlikely.paint(shown(np.zeros(1)), np.zeros(1)).astype(int) - colors[0]).max() <= 2
 
 
 def test_the_legend_of_chances_reads_in_chances() -> None:
-    likely, every = (legend_html(scale_of("probability", least, HEIGHTS)) for least in (0.5, 0.2))
+    likely, every = (legend_html(scale_of("marginal probability", some)) for some in (LIKELY, UNLIKELY))
     assert re.findall("<span>(.*?)</span>", likely) == ["1 in 2", "9 in 10", "99 in 100", "999 in 1000"]
     assert re.findall("<span>(.*?)</span>", every) == ["1 in 1000", "1 in 2", "999 in 1000"]
     assert "chance that a voxel is occupied" in likely
 
 
 def test_the_scale_reaches_down_when_improbable_voxels_are_shown() -> None:
-    assert scale_of("probability", 0.5, HEIGHTS).low == 0.0
-    low = scale_of("probability", 0.2, HEIGHTS)
-    dark = voxel_colors(low, shown(np.array([-20.0])), np.zeros(1))
+    assert scale_of("marginal probability", LIKELY).low == 0.0
+    low = scale_of("marginal probability", UNLIKELY)
+    dark = low.paint(shown(np.array([-20.0])), np.zeros(1))
     np.testing.assert_array_equal(dark[0], low.colors[0])
 
 
-def test_uncertainty_is_brightest_at_one_half() -> None:
-    scale = scale_of("uncertainty", 0.5, HEIGHTS)
-    colors = voxel_colors(scale, shown(np.array([0.0, 1.0, -1.0, 12.0])), np.zeros(4)).astype(int)
+def test_uncertainty_is_brightest_at_one_half_and_its_ends_are_where_the_values_lie() -> None:
+    log_odds = np.array([0.0, 1.0, -1.0, 7.0])
+    scale = scale_of("uncertainty", shown(log_odds))
+    p = 1 / (1 + np.exp(-log_odds))
+    entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))  # 1, 0.84, 0.84 and 0.0105 bits
+    assert (scale.low, scale.high) == (0.06, 1.0)  # two in a hundred lie below: 0.0603 bits
+    colors = scale.paint(shown(log_odds), np.zeros(4))
+    share = np.log(np.maximum(entropy, scale.low) / scale.low) / np.log(scale.high / scale.low)
+    expected = scale.colors[np.rint(255 * share).astype(int)].astype(int)
+    assert np.abs(colors - expected).max() <= 2
     np.testing.assert_array_equal(colors[0], scale.colors[255])
-    p = 1 / (1 + math.exp(-1))
-    entropy = -(p * math.log2(p) + (1 - p) * math.log2(1 - p))
-    np.testing.assert_array_equal(colors[1], scale.colors[round(255 * entropy)])
-    np.testing.assert_array_equal(colors[1], colors[2])
     np.testing.assert_array_equal(colors[3], scale.colors[0])
+    assert scale.colors[0].max() > 60  # no black
 
 
-def test_keyframes_are_counted_on_a_logarithmic_scale() -> None:
-    scale = scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=60)
-    assert (scale.low, scale.high) == (1.0, 64.0)
-    seen = np.array([0, 1, 8, 64, 255])
-    colors = voxel_colors(scale, shown(np.zeros(5), seen), np.zeros(5))
-    np.testing.assert_array_equal(colors, scale.colors[[0, 0, round(255 / 2), 255, 255]])
-    assert scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=0).high == 4.0
+def test_keyframes_are_counted_on_a_logarithmic_scale_up_to_the_most_that_there_are() -> None:
+    seen = np.array([0, 1, 9, 81, 90])
+    scale = scale_of("keyframes that see it", shown(np.zeros(5), seen))
+    assert (scale.low, scale.high) == (1.0, 90.0)
+    colors = scale.paint(shown(np.zeros(5), seen), np.zeros(5))
+    steps = [0, 0, *(round(255 * math.log(many) / math.log(90)) for many in (9, 81)), 255]
+    np.testing.assert_array_equal(colors, scale.colors[steps])
+    assert scale_of("keyframes that see it").high == 2.0
 
 
 def test_heights_run_over_the_map() -> None:
-    scale = scale_of("height", 0.5, HEIGHTS)
-    colors = voxel_colors(scale, shown(np.zeros(3)), np.array([0.0, 1.0, 2.0]))
+    scale = scale_of("height", heights_m=(1.0, 3.0))
+    colors = scale.paint(shown(np.zeros(3)), np.array([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(colors, scale.colors[[0, 128, 255]])
+    assert re.findall("<span>(.*?)</span>", legend_html(scale))[::2] == ["0", "2"]
+
+
+def test_stray_voxels_do_not_stretch_the_range_of_heights() -> None:
+    store = VoxelStore()
+    flat = np.array([[x, y, 0] for x in range(8) for y in range(8)], np.int32)
+    store.put(flat, log_odds=np.full((64, 512), 900, np.int16))
+    speck = np.full((1, 512), -900, np.int16)
+    speck[0, 0] = 900
+    store.put(np.array([[0, 0, 7]], np.int32), log_odds=speck)
+    scale = look_of(ViewOptions(), store, (2, 1), 0.1).scale
+    assert (scale.low, scale.high) == pytest.approx((0.0, 0.8))
+    turned = VoxelStore()
+    for brick in flat[::-1]:
+        turned.put(brick[None], log_odds=np.full((1, 512), 900, np.int16))
+    turned.put(np.array([[0, 0, 7]], np.int32), log_odds=speck)
+    np.testing.assert_array_equal(turned.sample(0.0)[1], store.sample(0.0)[1])  # whatever order they came in
 
 
 def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
-    scale, store = scale_of("photo", 0.5, HEIGHTS), VoxelStore()
+    scale, store = scale_of("photo"), VoxelStore()
     bricks = np.array([[0, 0, 0], [0, 0, 1], [9, 0, 0]], np.int32)
     colors = np.random.default_rng(0).integers(0, 255, (3, 512, 3)).astype(np.uint8)
     store.put(bricks[:2], colors=colors[:2])  # may come before the voxels, which are hidden until then
     assert not len(store.shown((0, 0, 0), 0.0, None).cells)
     assert store.put(bricks, log_odds=np.full((3, 512), 100, np.int16), seen=np.ones((3, 512), np.uint8))
     seen = store.shown((0, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(voxel_colors(scale, seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
+    np.testing.assert_array_equal(scale.paint(seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
     unseen = store.shown((1, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(voxel_colors(scale, unseen, np.zeros(512)), np.full((512, 3), NO_COLOR))
-    dark = voxel_colors(scale, seen, np.zeros(1024), np.full(1024, 3, np.uint8))
-    assert (dark <= colors[:2].reshape(-1, 3)).all()
+    np.testing.assert_array_equal(scale.paint(unseen, np.zeros(512)), np.full((512, 3), NO_COLOR))
     assert "grey where none did" in legend_html(scale)
     store.remove(bricks[:1])
     left = store.shown((0, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
+    np.testing.assert_array_equal(scale.paint(left, np.zeros(512)), colors[1])
 
 
-@pytest.mark.parametrize("color_by", ["height", "uncertainty", "keyframes", "changes"])
-def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
-    scale = scale_of(color_by, 0.5, HEIGHTS)
-    text = legend_html(scale)
-    assert f"<span>{scale.low:.3g}</span>" in text
-    assert f"<span>{scale.high:.3g}</span>" in text
+@pytest.mark.parametrize("name", COLORINGS)
+def test_every_colouring_has_a_help_and_one_with_a_scale_a_legend_with_its_ends(name: str) -> None:
+    assert COLORINGS[name].help.endswith(".")
+    scale = scale_of(name, shown(np.array([0.0, 2.0, 5.0]), np.array([1, 2, 3])))
+    marks = re.findall("<span>(.*?)</span>", legend_html(scale))
+    assert bool(marks) == bool(len(scale.colors))
+    if name in ("uncertainty", "keyframes that see it"):
+        assert marks == [f"{scale.low:.3g}", scale.measure.label, f"{scale.high:.3g}"]
 
 
 def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
@@ -139,7 +166,8 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
     large.put(np.array([[5, 5, 5]], np.int32), log_odds=np.zeros((1, 512), np.int16))
-    by_marginal, by_height = ViewOptions("voxels by probability"), ViewOptions()
+    by_marginal, by_height = ViewOptions(color_by="marginal probability"), ViewOptions()
+    assert not len(small.sample(0.0)[0].cells)
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
     assert look_of(by_height, small, up, 0.05) != look_of(by_height, large, up, 0.05)
@@ -152,7 +180,8 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
         {"cut_axis": "x"},
         {"size": 0.5},
         {"shade": False},
-        {"look": "voxels by uncertainty"},
+        {"color_by": "uncertainty"},
+        {"changes": False},
     ],
     ids=str,
 )
@@ -303,10 +332,8 @@ def test_surfaces_are_darkened_by_the_way_they_face() -> None:
     for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True):
         missing = [sum(not grid[tuple(c)] for c in neighbours(cell, axis)) for axis in range(3)]
         assert number == (missing[0] * 3 + missing[1]) * 3 + missing[2]
-    scale = scale_of("probability", 0.5, HEIGHTS)
-    bright = shown(np.full(3, 9.0))
-    plain = voxel_colors(scale, bright, np.zeros(3)).astype(float)
-    dark = voxel_colors(scale, bright, np.zeros(3), np.array([18, 2, 0], np.uint8)).astype(float)
+    bright = np.full((3, 3), (60, 140, 190), np.uint8)
+    plain, dark = bright.astype(float), shaded(bright, np.array([18, 2, 0], np.uint8)).astype(float)
     assert np.all(dark[0] < 0.8 * plain[0] + 1)
     np.testing.assert_array_equal(dark[1], plain[1])  # level surfaces stay as bright as the scale says
 

@@ -16,10 +16,11 @@ from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, w
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.answer import SWITCHES
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, SWITCHES, Dragged
+from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Dragged
 from taichi_mrf.viewer.scene.base_panel import Joined, Used
-from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
@@ -153,13 +154,13 @@ def test_at_first_all_keyframes_are_switched_and_a_chosen_range_stays(handled: L
 
 
 def test_what_the_mapping_process_gives_up_is_not_ticked_any_more(handled: LivePage) -> None:
-    handled.page.panel.view_options.handles["show_baseline"].value = True
+    handled.page.panel.view_options.handles["baseline"].value = True
     handled.page._take_options()
     handled.take(m.Notice("baseline: out of memory", "error"))
-    assert handled.page.options.show_baseline
+    assert handled.page.options.baseline
     handled.take(m.Notice("baseline: out of memory", "error", gives_up="baseline"))
-    assert not handled.page.options.show_baseline
-    assert not handled.page.panel.view_options.handles["show_baseline"].value
+    assert not handled.page.options.baseline
+    assert not handled.page.panel.view_options.handles["baseline"].value
     assert [each.baseline for each in handled.asked if isinstance(each, m.Watch)] == [True, False]
 
 
@@ -218,18 +219,17 @@ def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
 
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: LivePage) -> None:
-    looks = handled.page.panel.view_options.handles["look"]
-    assert "voxels by keyframes" in looks.options
-    assert not {"voxels in photo colours", "surface by height", "changes"} & {*looks.options}
-    assert {"free and unknown space", "measured points of the keyframe"} <= {*looks.options}
+    offered = handled.page.panel.view_options.handles["color_by"]
+    assert "keyframes that see it" in offered.options
+    assert "photo" not in offered.options
     handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
-    assert "voxels by keyframes" not in looks.options
-    assert "voxels in photo colours" in looks.options
+    assert "keyframes that see it" not in offered.options
+    assert "photo" in offered.options
 
 
 def test_measured_points_lie_where_their_keyframe_is(handled: LivePage) -> None:
     page = handled.page
-    page.panel.view_options.handles["look"].value = "measured points of the keyframe"
+    page.panel.view_options.handles["points"].value = True
     page._take_options()
     assert handled.asked == [m.Watch(False, None, False, points=0)]
     points, colors = np.array([[0, 0, 1], [0, 0, 2]], np.float32), np.zeros((2, 3), np.uint8)
@@ -240,12 +240,12 @@ def test_measured_points_lie_where_their_keyframe_is(handled: LivePage) -> None:
     node = handled.server.scene.get_handle_by_name("/measured")
     assert isinstance(node, viser.PointCloudHandle)
     assert node.visible
-    assert page.panel._shown.content.startswith("2 measured points shown")
+    assert page.panel._shown.content.startswith("0 voxels shown, 2 measured points")
     handled.take(keyframe(0, 3.0))
     np.testing.assert_array_equal(node.position, [3.0, 0.0, 0.0])
     page._choose(1)
     assert handled.asked[-1] == m.Watch(False, None, False, points=1)
-    page.panel.view_options.handles["look"].value = "voxels by height"
+    page.panel.view_options.handles["points"].value = False
     page._take_options()
     page._flush()
     assert not node.visible
@@ -269,8 +269,6 @@ def test_voxels_of_an_earlier_map_are_pale_until_todays_keyframes_change_them(
         return np.stack([sent.colors[~upper], sent.colors[upper]]).astype(int)
 
     handled.take(replace(HELLO, located="3 cm, 0.8 degrees, 91% of what is seen agrees"))
-    handled.page.panel.view_options.handles["look"].value = "voxels by height"
-    handled.page._take_options()
     put(bricks, 100)
     handled.take(replace(keyframe(0), earlier=True))
     usual = colors()
@@ -294,24 +292,31 @@ def test_voxels_of_a_map_of_its_own_are_never_pale(handled: LivePage) -> None:
     assert not handled.page.map.store.shown((0, 0, 0), 0.0, None).is_earlier.any()
 
 
-def test_free_space_is_seen_in_a_cut_that_goes_with_the_look(handled: LivePage) -> None:
+def test_free_space_is_seen_in_a_cut_that_goes_with_it_unless_it_was_chosen(handled: LivePage) -> None:
     page, handles = handled.page, handled.page.panel.view_options.handles
-    for look, axis in (("free and unknown space", "y"), ("voxels by height", "none")):
-        handles["look"].value = look
+
+    def use(**values: object) -> tuple[bool, str]:
+        """Free space and the axis of the cut after a use of these widgets."""
+        for name, value in values.items():
+            handles[name].value = value
         page._take_options()
-        assert page.options.cut_axis == handles["cut_axis"].value == axis
-        page.options = page.panel.view_options.value()
-    handles["cut_axis"].value = "x"
-    handles["look"].value = "free and unknown space"
-    page._take_options()
-    assert page.options.cut_axis == "x"
+        assert page.options == page.panel.view_options.value()
+        return page.options.free_space, page.options.cut_axis
+
+    assert use(free_space=True) == (True, "y")
+    assert use(free_space=False) == (False, "none")
+    assert use(cut_axis="x") == (False, "x")
+    assert use(free_space=True) == (True, "x")
+    assert use(free_space=False) == (False, "x")
+    use(free_space=True)
+    assert use(cut_axis="none") == (False, "none")
 
 
 def test_a_level_cut_keeps_the_lower_half_where_y_points_down(handled: LivePage) -> None:
     take_both_maps(handled)
     page, handles = handled.page, handled.page.panel.view_options.handles
     page._flush()
-    handles["look"].value = "free and unknown space"
+    handles["free_space"].value = True
     page._take_options()
     slider, size = handles["cut_at_m"], HELLO.voxel_size
     assert (page.options.cut_axis, slider.min, slider.max) == ("y", pytest.approx(-8 * size), 0.0)
@@ -477,7 +482,7 @@ def take_both_maps(handled: LivePage) -> None:
 
 def test_the_baseline_does_not_discard_the_viewpoint(handled: LivePage, browser: RawClient) -> None:
     camera = camera_of_a_user(handled, browser)
-    handled.page.options = replace(ViewOptions(), show_baseline=True)
+    handled.page.options = replace(ViewOptions(), baseline=True)
     take_both_maps(handled)
     handled.page._flush()
     assert handled.page._with_baseline
@@ -501,8 +506,8 @@ def test_the_map_of_another_recording_is_looked_at_anew(
 def test_a_cut_parts_the_map_from_the_baseline(handled: LivePage, flipped: bool) -> None:
     take_both_maps(handled)
     at_m = -3.5 * HELLO.voxel_size  # its height: y points down
-    cut = ViewOptions(show_baseline=True, cut_axis="y", cut_at_m=at_m, flip_cut=flipped)
-    for options, many in ((ViewOptions(show_baseline=True), (8, 8)), (cut, (4, 4) if flipped else (5, 3))):
+    cut = ViewOptions(baseline=True, cut_axis="y", cut_at_m=at_m, flip_cut=flipped)
+    for options, many in ((ViewOptions(baseline=True), (8, 8)), (cut, (4, 4) if flipped else (5, 3))):
         handled.page.options = options
         handled.page.map.look_changed()
         handled.page._flush()
@@ -596,9 +601,9 @@ def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: LivePage)
     handled.take(replace(ring, state="off"))
     assert nodes(handled) == {"/keyframes/0", "/keyframes/1"}
     handled.take(ring)
-    handled.page.keyframes.show_pictures(False)
+    handled.page.keyframes.show(True, False, True)
     assert nodes(handled) == {"/keyframes/0", "/keyframes/1"}
-    handled.page.keyframes.show_pictures(True)
+    handled.page.keyframes.show(True, True, True)
     handled.take(m.CurrentCamera("a scan", np.eye(4), lidar))
     handled.page.keyframes.clear()
     assert nodes(handled) == set()

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, pack_log_odds
-from taichi_mrf.viewer.scene.coloring import ViewOptions
 from taichi_mrf.viewer.scene.map_scene import brick_edges
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import FREE, OCCUPIED, UNKNOWN, cut_of, cut_picture
 from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS, offsets_in_brick

@@ -1,6 +1,7 @@
 """The measured surface on the page: meshes in the colours of the scale, in the place of voxels."""
 
 import json
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,8 +13,9 @@ from handled_page import HandledPage
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.live.panel import Clicked
-from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.scene.coloring import COLORINGS, Coloring, Measure, legend_html
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 
 VOXEL = 0.1
 HELLO = m.Hello(
@@ -34,11 +36,10 @@ VIEW = m.SurfaceView(
     up=np.array([0.0, 0.0, 1.0]),
     light=np.array([0.6, -0.8, 0.0]),
     fov_rad=0.6,
-    floor_m=1.0,
-    range_m=2.0,
     photo=False,
 )
 CHUNK = (0, -1, 0)
+GREYS = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
 
 
 def patch(colors: np.ndarray | None = None, empty: bool = False) -> m.SurfacePatch:
@@ -135,15 +136,16 @@ def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePa
     scene = drawn.page.map
     assert scene is not None
     assert scene.scale is not None
-    assert scene.scale.color_by == "probability"  # voxels show how sure the map is while it grows
+    assert "chance" in scene.scale.measure.label  # voxels show how sure the map is while it grows
     drawn.take(VIEW)
     assert drawn.draw() == "2 triangles of the measured surface shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
     vertices, triangles, _ = drawn.mesh()
     np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)
-    assert scene.scale.color_by == "height"
-    assert drawn.draw(look="voxels by height") == "512 voxels shown"
-    assert scene.scale.color_by == "height"
+    on_surface = scene.scale
+    assert "height" in on_surface.measure.label
+    assert drawn.draw(draw_as="voxels") == "512 voxels shown"
+    assert scene.scale == on_surface  # one range of heights for both
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (True, False)
     drawn.take(patch(empty=True))
     assert drawn.draw() == "512 voxels shown"
@@ -184,17 +186,16 @@ def test_a_browser_begins_with_the_view_of_the_picture(drawn: SurfacePage) -> No
 def test_the_page_opens_in_the_colours_of_photographs_where_the_picture_does() -> None:
     running = SurfacePage()
     try:
-        photo, other = "surface in photo colours", "voxels by uncertainty"
-        for chosen, expected in ((None, photo), (other, other), (None, photo)):
-            widget = running.page.panel.view_options.handles["look"]
-            widget.value = chosen or ViewOptions().look
+        for chosen, expected in (("height", "photo"), ("uncertainty", "uncertainty"), ("height", "photo")):
+            widget = running.page.panel.view_options.handles["color_by"]
+            widget.value = chosen
             running.take(replace(HELLO, has_colors=True))
             running.take(replace(VIEW, photo=True))
             assert widget.value == expected
-        widget.value = "surface by height"
+        widget.value = "height"
         running.take(replace(VIEW, photo=True))
-        assert widget.value == "surface by height"  # a user has chosen it
-        running.page.options = ViewOptions(photo)
+        assert widget.value == "height"  # a user has chosen it
+        running.page.options = ViewOptions(color_by="photo")
         assert not running.page._extras(running.page.options)[2]  # the patches have colours of their own
     finally:
         running.server.stop()
@@ -205,9 +206,8 @@ def test_a_map_without_a_surface_offers_none() -> None:
     try:
         running.asked.clear()
         running.take(replace(HELLO, method="log_odds", has_surface=False))
-        looks = running.page.panel.view_options.handles["look"].options
-        assert not any("surface" in look for look in looks)
-        assert running.page.options.look == looks[0] == "voxels by height"
+        assert running.page.panel.view_options.handles["draw_as"].options == ("voxels",)
+        assert running.page.options.draw_as == "voxels"
         assert running.asked == []
     finally:
         running.server.stop()
@@ -226,22 +226,78 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     photo = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [90, 90, 90]], np.uint8)
     drawn.take(patch(photo))
     drawn.take(VIEW)
-    drawn.draw(look="surface in photo colours", shade=False)
+    high, occupied = np.array([[0, 0, 3]], np.int32), np.full((1, 512), 900, np.int16)
+    drawn.take(m.Bricks("map", high, occupied, np.ones((1, 512), np.uint8), high[:0]))
+    drawn.draw(color_by="photo", shade=False)
     assert np.abs(drawn.mesh()[2].astype(int) - photo).max() <= 1
-    drawn.draw(look="surface by uncertainty", shade=False)
+    drawn.draw(color_by="uncertainty", shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
-    assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
-    expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
+    # The standard deviations are 0.1, 0.2, 0.3 and 1 cm; equal ratios are equal steps.
+    assert (scale.low, scale.high, scale.measure.label) == (0.1, 1.0, "uncertainty: standard deviation (cm)")
+    expected = scale.colors[np.rint(255 * np.log10([1, 2, 3, 10])).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
     drawn.draw(shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
-    assert (scale.high, scale.label) == (2.0, "height above the lowest surface (m)")
+    assert (scale.low, scale.high) == pytest.approx((0.0, 3.2))  # of the voxels: four bricks
+    assert re.findall("<span>(.*?)</span>", legend_html(scale)) == ["0", scale.measure.label, "3.2"]
     lit = drawn.mesh()[2].astype(int)
-    assert np.abs(lit - scale.colors[[0, 0, 128, 0]]).max() <= 1
+    assert np.abs(lit - scale.colors[[80, 80, 159, 80]]).max() <= 1  # 1 and 2 of 3.2 m
     drawn.draw()
     assert np.abs(drawn.mesh()[2] - lit * (0.62 + 0.38 * 0.8)).max() <= 2
+
+
+def test_the_surface_has_the_colours_of_the_voxels_behind_it(drawn: SurfacePage) -> None:
+    log_odds = np.full((8, 8, 8), -900, np.int16)
+    log_odds[7], log_odds[0] = 2353, 0  # 99 in 100, even chances
+    brick, seen = np.array([[1, -4, 1]], np.int32), np.zeros((1, 512), np.uint8)
+    drawn.take(m.Bricks("map", brick, log_odds.reshape(1, 512), seen, brick[:0]))
+    vertices = np.array([[1.55, -3, 1.25], [0.85, -3, 1.25], [2.05, -3, 1.25]], np.float32)
+    normals = np.tile(np.array([0, -127, 0], np.int8), (3, 1))
+    normals[:] = (0, 127, 0)  # seen from +y: the voxel behind is at y = -3.05
+    drawn.take(replace(patch(), vertices_m=vertices, triangles=patch().triangles[:1], normals=normals,
+                       std_m=np.zeros(3, np.float32)), VIEW)  # fmt: skip
+    drawn.draw(color_by="marginal probability", shade=False)
+    sure, unsure, unknown = drawn.mesh()[2].astype(int)
+    assert np.abs(sure - (150, 200, 180)).max() <= 2
+    assert np.abs(unsure - (240, 110, 40)).max() <= 2
+    assert np.abs(unknown - (240, 110, 40)).max() <= 2
+    log_odds[7] = 0  # an edit
+    drawn.take(m.Bricks("map", brick, log_odds.reshape(1, 512), seen, brick[:0]))
+    assert drawn.page.map is not None
+    drawn.page.map._sent_at = 0.0
+    drawn.page._flush()
+    assert np.abs(drawn.mesh()[2][0].astype(int) - (240, 110, 40)).max() <= 2
+
+
+def test_an_entry_of_the_table_is_a_colouring_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its name in the list with its help, its colours on voxels and surface, its legend, and its data."""
+    of_z = Measure("place in the chunk", lambda shown, heights_m: shown.cells[:, 2], lambda low, high: GREYS)
+    of_x = Measure("metres along x", lambda patch, heights_m: patch.vertices_m[:, 0], lambda low, high: GREYS)
+    monkeypatch.setitem(COLORINGS, "place", Coloring("where in its chunk.", of_z, of_x, needs="counts"))
+    running = SurfacePage()
+    try:
+        widget = running.page.panel.view_options.handles["color_by"]
+        assert "place" in widget.options
+        widget.value = "place"
+        running.draw(color_by="place", draw_as="voxels", shade=False)
+        assert running.asked[-1] == m.Watch(False, None, False, counts=True)
+        assert widget.hint.endswith("where in its chunk.")
+        (sent,) = running.page.map.layers["map"]._sent.values()
+        # The voxels are at 0 to 7 in the chunk.
+        np.testing.assert_array_equal(sent.colors[:, 0], np.rint(255.0 * sent.cells[:, 2] / 7))
+        assert re.findall("<span>(.*?)</span>", running.page.panel._legend.content) == [
+            "0", "place in the chunk", "7",
+        ]  # fmt: skip
+        running.take(patch(), VIEW)
+        running.draw(color_by="place", shade=False)
+        assert np.abs(running.mesh()[2][:, 0].astype(int) - 255 * np.array([0, 2, 2, 4]) / 4).max() <= 1
+        assert "metres along x" in running.page.panel._legend.content
+        running.take(replace(HELLO, counts_keyframes=False))
+        assert "place" not in widget.options
+    finally:
+        running.server.stop()
 
 
 def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> None:
@@ -254,18 +310,22 @@ def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> No
     assert asked.point == pytest.approx((3.0, -3.0, 2.0))
 
 
+OF_MAP = {"draw_as", "color_by", "threshold", "size", "shade", "pictures"}
+
+
 def test_options_without_effect_are_hidden(drawn: SurfacePage) -> None:
     def used() -> set[str]:
         handles = drawn.page.panel.view_options.handles
-        return {name for name in ("threshold", "size", "shade") if handles[name].visible}
+        return {name for name, handle in handles.items() if handle.visible} & OF_MAP
 
     drawn.take(status(finished=False))
     drawn.draw()
-    assert used() == {"threshold", "size", "shade"}  # voxels take the place of the surface
+    assert used() == OF_MAP  # voxels take the place of the surface
     drawn.take(status())
     assert drawn.draw().startswith("2 tri")
-    assert used() == {"shade"}
-    drawn.draw(look="measured points of the keyframe")
-    assert used() == set()
-    drawn.draw(look="voxels by height")
-    assert used() == {"threshold", "size", "shade"}
+    assert used() == OF_MAP - {"threshold", "size"}
+    drawn.draw(map=False)
+    assert used() == {"pictures"}
+    assert not drawn.page.panel._legend.content
+    drawn.draw(draw_as="voxels", keyframes=False)
+    assert used() == OF_MAP - {"pictures"}

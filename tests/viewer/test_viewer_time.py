@@ -11,7 +11,8 @@ from handled_page import HandledPage
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.live.panel import PLAY_TIME
-from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, ViewOptions
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
 START_S = 1.7e9
@@ -101,7 +102,7 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     running.take(m.Bricks("dynamic", brick, dynamic, seen, NOTHING))
     assert (len(colors(running)), red(running)) == (40, 7)
     assert not greys(running)
-    running.page.options = ViewOptions("changes")
+    running.page.options = ViewOptions(color_by="plain grey")
     running.page.map.look_changed()
     assert (greys(running), red(running)) == (33, 7)
     running.page.show_counts()
@@ -115,10 +116,14 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     np.testing.assert_allclose(box.points.reshape(-1, 3).min(axis=0), [0.75, 1.7, 0.05], atol=1e-6)
     np.testing.assert_allclose(box.points.reshape(-1, 3).max(axis=0), [1.25, 2.3, 0.75], atol=1e-6)
     assert "left" in running.page.panel._legend.content
+    running.page.options = ViewOptions(changes=False)
+    running.page.map.look_changed()
+    assert red(running) == 0
+    assert "left" not in running.page.panel._legend.content
+    assert running.server.scene.get_handle_by_name("/changes") is None
     running.page.options = ViewOptions()
     running.page.map.look_changed()
     assert red(running) == 7
-    assert running.server.scene.get_handle_by_name("/changes") is None
     running.take(m.Bricks("dynamic", brick[:0], dynamic[:0], seen[:0], brick))
     assert (len(colors(running)), red(running)) == (40, 0)
 

@@ -11,6 +11,7 @@ import viser.transforms as vtf
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.answer import SWITCHES, VoxelAnswer, beside, facts_of, facts_of_many
 from taichi_mrf.viewer.live.panel import (
     AGREE,
     CHOSEN_KEYFRAME,
@@ -18,20 +19,16 @@ from taichi_mrf.viewer.live.panel import (
     PLAY_TIME,
     POSITION_STEP_M,
     SPEEDS,
-    SWITCHES,
     Clicked,
     Dragged,
     Framed,
     Panel,
-    VoxelAnswer,
-    beside,
-    facts_of,
-    facts_of_many,
 )
 from taichi_mrf.viewer.scene.base_page import POP_UP_S, BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
-from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.scene.coloring import COLORINGS
 from taichi_mrf.viewer.scene.keyframe_layer import first_pixel, first_voxel, framed
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import change, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
@@ -39,7 +36,7 @@ from taichi_mrf.viewer.transport.pulse import LINK
 MOST_ASKED = 32
 """Of as many voxels in a rectangle keyframes are asked at most."""
 
-_PLAIN = ViewOptions("voxels by height")
+_PLAIN = ViewOptions(draw_as="voxels")
 """Options that the mapping process serves unless it is asked for more."""
 
 
@@ -125,7 +122,7 @@ class Page(BasePage[Panel]):
         """Show a notice, and no box as ticked for what there is no more."""
         super().notify(notice)
         if notice.gives_up:
-            self.panel.view_options.handles[f"show_{notice.gives_up}"].value = False
+            self.panel.view_options.handles[notice.gives_up].value = False
             self._take_options()
 
     def look_from(self, side: Side, client: int) -> None:
@@ -179,7 +176,7 @@ class Page(BasePage[Panel]):
         if not self.keyframes.keyframes:
             self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
-            if self.options.shows == "points":
+            if self.options.points:
                 self._ask_for_extras()
         if self._hello.has_frames or keyframe.id in self.keyframes.keyframes:
             change(self.panel.unsaved, visible=True)
@@ -338,7 +335,7 @@ class Page(BasePage[Panel]):
         self.keyframes.choose(keyframe)
         self.panel.show_keyframes(self.keyframes.keyframes, keyframe)
         watched = self.panel.images.value and self.panel.view.value == CHOSEN_KEYFRAME
-        if watched or self.options.shows == "points":
+        if watched or self.options.points:
             self._ask_for_extras()
 
     def _watch_images(self) -> None:
@@ -357,7 +354,7 @@ class Page(BasePage[Panel]):
         if self.map is None:
             return
         shown = [k for k in self.keyframes.keyframes.values() if k.state != "frozen"]
-        pixel = first_pixel(click.origin, click.direction, shown)
+        pixel = first_pixel(click.origin, click.direction, shown if self.options.keyframes else [])
         voxel = first_voxel(click.origin, click.direction, self.map.points(), self._hello.voxel_size)
         if pixel is not None and (voxel is None or pixel.range_m < voxel[1]):
             self._choose(pixel.keyframe)
@@ -409,11 +406,12 @@ class Page(BasePage[Panel]):
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool, int | None]:
         """Needs of the options: the baseline's map, the counts of keyframes, the colours of voxels, the
-        measured surface, which has colours of its own, and the keyframe whose points are shown."""
-        by, surface = options.color_by, options.shows == "surface"
-        instead = options.shows == "points" or (surface and self.map is not None and not self.map.growing)
-        points = self.keyframes.chosen if options.shows == "points" else None
-        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface, points
+        measured surface, which may have colours of its own, and the keyframe whose points are shown."""
+        coloring, surface = COLORINGS[options.color_by], options.draw_as == "surface"
+        growing = self.map is None or self.map.growing
+        needs = "" if surface and coloring.surface and not growing else coloring.needs
+        points = self.keyframes.chosen if options.points else None
+        return options.baseline, needs == "counts", needs == "colors", surface, points
 
 
 def _click_of(event: viser.SceneClickEvent) -> Clicked:

@@ -1,34 +1,19 @@
-"""The widgets of the live page, with the folder "Time" of a map whose world may change, and the answer to a
-click on a voxel in a panel beside it. The page decides what they do.
-"""
+"""The widgets of the live page, with the folder "Time" of a map whose world may change."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
-from taichi_mrf.viewer.scene.coloring import ViewOptions, looks_of
-from taichi_mrf.viewer.scene.keyframe_layer import draw_lines
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.voxel_store import VoxelStore
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
-
-Point = tuple[float, float, float]
-Vote = tuple[m.KeyframeInfo, float]
-"""A keyframe, and the log-odds that it adds to a voxel."""
-
-SWITCHES = tuple(f"switch off {place}" for place in range(5))
-"""Actions of the buttons beside what keyframes say of a voxel, by their places in the list."""
-
-_ASIDE_PX, _WIDTH_PX, _HEIGHT_PX = 65, 290, 430
-"""Size of the panel with all buttons, and its distance from the voxel."""
-_LINE_COLOR = (255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -86,9 +71,6 @@ CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
-_MAP_OPTIONS = (
-    "threshold", "size", "shade", "cut_axis", "cut_at_m", "flip_cut", "bricks", "show_baseline",
-)  # fmt: skip
 TIME_STEP_S, PLAY_TIME = 0.1, "Play through time"
 
 
@@ -106,7 +88,6 @@ class Panel(BasePanel):
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         hint = "Replay the recording at this multiple of its own pace."
         self.speed = self.watch(gui.add_dropdown("Speed", list(SPEEDS), hint=hint))
-        self.view_options.add("look")
         self.add_legend()
         self.add_counts()
         self.add_buttons(
@@ -124,10 +105,7 @@ class Panel(BasePanel):
         self.time = TimeFolder(gui, self)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
-            self.view_options.add(*_MAP_OPTIONS)
-            with gui.add_folder("Space"):
-                self.view_options.add("ground", "axes")
-            self.view_options.add("pictures")
+            self.add_layers("follow")
             self.add_button(*self.DARK_OR_LIGHT)
         with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
             self._keyframe_tab()
@@ -150,7 +128,7 @@ class Panel(BasePanel):
         self._hello = hello
         self.show_recording(hello)
         self.time.begin(hello.has_dates)
-        self.view_options.offer("look", looks_of(hello))
+        self.offer(hello)
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -178,10 +156,10 @@ class Panel(BasePanel):
         box.value = (not box.value) if on is None else on
 
     def show_in_photo_colors(self) -> None:
-        """Show the colours that cameras saw, unless a user has chosen another look than the first one."""
-        widget = self.view_options.handles["look"]
-        if widget.value == ViewOptions().look:
-            widget.value = "surface in photo colours"
+        """Show the colours that cameras saw, unless a user has chosen others than the first ones."""
+        now, first = self.view_options.value(), ViewOptions()
+        if (now.draw_as, now.color_by) == (first.draw_as, first.color_by):
+            self.view_options.handles["color_by"].value = "photo"
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
@@ -405,96 +383,3 @@ def _in_words(change: m.SceneChange, start_s: float) -> str:
 
 def _on_grid(seconds: float) -> float:
     return round(round(seconds / TIME_STEP_S) * TIME_STEP_S, 6)
-
-
-class VoxelAnswer:
-    """Owns a floating panel, and the scene nodes /answer, a label at the voxel, and /distance."""
-
-    def __init__(self, scene: viser.SceneApi, panel: BasePanel) -> None:
-        self._scene = scene
-        self.point: Point | None = None
-        """The voxel that is shown, in metres, world; None without one."""
-        self._apart: dict[str, str] = {}
-        self._panel = panel.gui.add_panel(visible=False)
-        with self._panel.add_tab("Answer", viser.Icon.CUBE):
-            self._text = panel.gui.add_html("")
-            hint = "Remove this keyframe from the map; Undo brings it back."
-            self._switches = [panel.add_button("", hint, action, visible=False) for action in SWITCHES]
-            panel.add_button("Close", color="gray")
-        self.said_by: list[int] = []
-        """The keyframes that are listed."""
-
-    def move(self, point: Point, place: tuple[float, float]) -> None:
-        """Go to a voxel, show the panel at a ``place`` in the window (pixels), and a line from the last."""
-        before, self.point = self.point, point
-        self._panel.float(x=place[0], y=place[1], width=_WIDTH_PX)
-        self._panel.visible = True
-        self._panel.expand()
-        if before is not None and before != point:
-            ends = np.array([before, point])
-            self._apart = {"from the last click": f"{np.linalg.norm(ends[1] - ends[0]):.2f} m"}
-            draw_lines(self._scene, "/distance", ends[None], _LINE_COLOR)
-
-    def show(self, facts: dict[str, str], votes: Sequence[Vote] = (), known: bool | None = None) -> None:
-        """Show the facts of the voxel, and which keyframes say that it is occupied or free, the strongest
-        first, each with a button; ``known`` is None before they have been asked."""
-        label = facts.get("state") or f"{facts['voxels']} voxels"
-        self._scene.add_label("/answer", label, position=np.array(self.point))
-        text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
-        if known:
-            seen_by = f"{len(votes)} keyframes see this" if len(votes) > 1 else "one keyframe sees this"
-            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees this"
-        self._text.content = (
-            f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
-        )
-        self.said_by = [keyframe.id for keyframe, _ in votes[: len(SWITCHES)]]
-        for i, button in enumerate(self._switches):
-            button.visible = i < len(self.said_by)
-            if button.visible:
-                button.label = f"Switch off {votes[i][0].name}: {in_words(votes[i][1])}"
-
-    def clear(self) -> None:
-        """Hide the answer, and remove the line from the scene."""
-        self.point, self._apart, self.said_by, self._panel.visible = None, {}, [], False
-        for name in ("/answer", "/distance"):
-            self._scene.remove_by_name(name)
-
-
-def beside(camera: viser.CameraHandle, share: ArrayLike) -> tuple[float, float]:
-    """The panel's upper left corner, in pixels: beside a place (2,), in shares of a browser's window, towards
-    its middle, as far as it fits in."""
-    width, height = camera.image_width, camera.image_height
-    x, y = (np.asarray(share) * (width, height)).tolist()
-    left = x + _ASIDE_PX if x < 0.45 * width else x - _ASIDE_PX - _WIDTH_PX
-    return max(left, 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
-
-
-def in_words(log_odds: float) -> str:
-    """Verdict of a keyframe alone on a voxel."""
-    sure = 1 / (1 + np.exp(-abs(log_odds)))
-    return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
-
-
-def facts_of_many(points: NDArray[np.float64]) -> dict[str, str]:
-    """Number, middle and size of some voxels with centres (n, 3) in metres."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return {
-        "voxels": f"{len(points):,}",
-        "middle x, y, z (m)": ", ".join(f"{value:.2f}" for value in (low + high) / 2),
-        "size x, y, z (m)": " x ".join(f"{value:.2f}" for value in high - low),
-    }
-
-
-def facts_of(point: NDArray[np.float64], store: VoxelStore, hello: m.Hello) -> dict[str, str]:
-    """Coordinates, state, probability and colour of the voxel at a point (3,) in metres, as shown."""
-    facts = {"x, y, z (m)": ", ".join(f"{value:.2f}" for value in point)}
-    found = store.voxel(np.floor(point / hello.voxel_size).astype(np.int64))
-    if found is None:
-        return facts | {"state": "unknown"}
-    log_odds = found[0] * m.LOG_ODDS_STEP
-    known = abs(log_odds - hello.prior_log_odds) >= hello.min_evidence
-    facts["state"] = "unknown" if not known else "occupied" if log_odds >= 0 else "free"
-    facts["probability"] = f"{1 / (1 + np.exp(-log_odds)):.3f}"
-    if found[1] is not None:
-        facts["colour (RGB)"] = ", ".join(str(part) for part in found[1].tolist())
-    return facts

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used
-from taichi_mrf.viewer.scene.coloring import SPACE, Scale, ViewOptions, key_html, legend_html
+from taichi_mrf.viewer.scene.coloring import Scale, key_html, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
+from taichi_mrf.viewer.scene.view_options import ViewOptions, drawings_of
 from taichi_mrf.viewer.scene.viewpoint import Side, ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
 from taichi_mrf.viewer.transport.pulse import Pulse
@@ -66,8 +67,9 @@ class BasePage(Generic[P]):
         self.keyframes = KeyframeLayer(server.scene)
         self.viewpoint = ViewpointController(server)
         self.map: MapScene | None = None
-        self._explained: tuple[Scale | None, ViewOptions] | None = None  # by the legend
+        self._explained: tuple[Scale | None, bool, bool] | None = None  # by the legend
         self._with_baseline = False
+        self._cut_for_space = False  # whether the cut was made to show free space
         self.actions: dict[str, Callable[[int], None]] = {
             BasePanel.DARK_OR_LIGHT[0]: self._turn_colors,
             **{side.capitalize(): partial(self.look_from, side) for side in get_args(Side)},
@@ -142,24 +144,26 @@ class BasePage(Generic[P]):
         before, self.options = self.options, self.panel.view_options.value()
         if self.options == before:
             return
-        if self.options.look != before.look and SPACE in (self.options.look, before.look):
-            self._cut_for_space(self.options)
+        self._pair_space_with_cut(before)
         if self.options.cut_axis != before.cut_axis:
             self._offer_cuts(in_middle=True)
             self.options = self.panel.view_options.value()
         self.options_changed(before)
-        self.keyframes.show_pictures(self.options.pictures)
+        self.keyframes.show(self.options.keyframes, self.options.pictures, self.options.path)
         if self.map is not None:
             self.map.look_changed()
 
-    def _cut_for_space(self, options: ViewOptions) -> None:
-        """Free space is seen in a cut only: make a level one for it, unless there is a cut, and leave it with
-        the look."""
-        axis = self.panel.view_options.handles["cut_axis"]
-        if options.look != SPACE:
-            axis.value = "none"
-        elif options.cut_axis == "none":
-            axis.value = "xyz"[self.viewpoint.up[0]]
+    def _pair_space_with_cut(self, before: ViewOptions) -> None:
+        """Free space is seen in a cut only: make a level one for it unless there is a cut, and take that away
+        with it; without a cut there is no free space to see."""
+        options, handles = self.options, self.panel.view_options.handles
+        if options.cut_axis != before.cut_axis:
+            self._cut_for_space = False
+            handles["free_space"].value &= options.cut_axis != "none"
+        elif options.free_space and options.cut_axis == "none":
+            handles["cut_axis"].value, self._cut_for_space = "xyz"[self.viewpoint.up[0]], True
+        elif self._cut_for_space and not options.free_space:
+            handles["cut_axis"].value, self._cut_for_space = "none", False
         self.options = self.panel.view_options.value()
 
     def _turn_colors(self, client: int) -> None:
@@ -185,19 +189,32 @@ class BasePage(Generic[P]):
             return
         self.show_counts()
         self._offer_cuts()
-        with_baseline = bool(self.map.layers["baseline"].store.chunks)
-        shaded = with_baseline or self.options.shows != "points"
-        self.panel.show_used(with_baseline or (shaded and not self.map.shows_surface), shaded)
-        if with_baseline != self._with_baseline:
-            self._with_baseline = with_baseline
+        self._show_used(self.map)
+        if self.map.has_baseline != self._with_baseline:
+            self._with_baseline = self.map.has_baseline
             self.viewpoint.look_at_everything()
         box = self.map.box_m()
         if box is not None:
             self.viewpoint.map_grew(*box)
-        shown = self.map.scale, self.options
-        if self.map.scale is not None and shown != self._explained:
+        in_cut = self.options.free_space and not self.map.has_baseline
+        shown = self.map.scale, in_cut, self.map.shows_changes
+        if shown != self._explained:
             self._explained = shown
-            self.panel.show_legend(legend_html(self.map.scale) + key_html(self.options))
+            legend = "" if shown[0] is None else legend_html(shown[0])
+            self.panel.show_legend(legend + key_html(*shown[1:]))
+
+    def _show_used(self, shown: MapScene) -> None:
+        """Show what belongs to the layers that are shown."""
+        voxels, some = shown.shows_voxels, self.options.map or shown.has_baseline
+        self.panel.show_used(
+            draw_as=self.options.map and len(drawings_of(shown.hello)) > 1,
+            color_by=some,
+            threshold=voxels,
+            size=voxels,
+            shade=some,
+            pictures=self.options.keyframes,
+            changes=shown.hello.has_dates,
+        )
 
 
 def _backdrop() -> NDArray[np.uint8]:

@@ -7,15 +7,16 @@ thread takes them out. viser runs callbacks on a pool of threads: a callback onl
 
 import queue
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from taichi_mrf.viewer.messages import Notice, Update
-from taichi_mrf.viewer.scene.coloring import ViewOptions
+from taichi_mrf.viewer.messages import Hello, Notice, Update
+from taichi_mrf.viewer.scene.coloring import COLORINGS
+from taichi_mrf.viewer.scene.view_options import OF_LAYER, ViewOptions, colorings_of, drawings_of
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, change, in_html
 from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
@@ -69,12 +70,10 @@ _MOST_NOTICES = 8
 
 _COUNTED = {
     "dynamic": "that move",
+    "points": "measured points",
     "baseline": "of the baseline",
 }
 """Layers that are counted beside voxels or the surface, and their words."""
-
-_INSTEAD = {"triangles": "triangles of the measured surface", "points": "measured points"}
-"""Layers that are shown in the place of voxels, and their words."""
 
 _SEVERITY_COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
 
@@ -91,6 +90,11 @@ class BasePanel:
         self._notices: list[Notice] = []
         self._activity = gui.add_html(_activity_html("Starting …"))
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
+
+    def add_layers(self, *without: str) -> None:
+        """Add the list of layers, each with what belongs to it, in the order of the options' fields."""
+        names = (each.name for each in fields(ViewOptions))
+        self.view_options.add(*(name for name in names if name not in without), indented=OF_LAYER)
 
     def add_counts(self) -> None:
         """Add the line that says how many voxels the page shows."""
@@ -136,11 +140,14 @@ class BasePanel:
     def show_counts(self, counts: Mapping[str, int], square_m: float | None, recording: bool) -> None:
         """Show how much the page shows, by the names that MapScene.counts has, how wide the squares on the
         ground are if there are any, and whether the scene is being recorded."""
-        what = f"{counts['map']:,} voxels"
-        for name, words in _INSTEAD.items():
-            what = f"{counts[name]:,} {words}" if name in counts else what
-        text = f"{what} shown"
-        text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
+        triangles = counts.get("triangles")
+        text = (
+            f"{counts['map']:,} voxels"
+            if triangles is None
+            else f"{triangles:,} triangles of the measured surface"
+        )
+        others = (f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts.get(name))
+        text += "".join([" shown", *others])
         text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
         self._shown.content = text + (" · recording" if recording else "")
 
@@ -154,10 +161,17 @@ class BasePanel:
             middle = round((low + high) / 2, 2) if in_middle else min(max(slider.value, low), high)
             change(slider, min=low, max=high, value=middle)
 
-    def show_used(self, voxels: bool, shaded: bool) -> None:
-        """Show the options of voxels, and that of shapes, while they have an effect."""
-        for name, used in (("threshold", voxels), ("size", voxels), ("shade", shaded)):
-            change(self.view_options.handles[name], visible=used)
+    def offer(self, hello: Hello) -> None:
+        """Offer the layers and colours that a map has the data for."""
+        self.view_options.offer("color_by", colorings_of(hello))
+        self.view_options.offer("draw_as", drawings_of(hello))
+
+    def show_used(self, **used: bool) -> None:
+        """Show the widgets of these view options while they have an effect; explain the chosen colours."""
+        colors = self.view_options.handles["color_by"]
+        change(colors, hint=f"The map's colours say {COLORINGS[colors.value].help}")
+        for name in used.keys() & self.view_options.handles.keys():
+            change(self.view_options.handles[name], visible=used[name])
 
     def show_legend(self, legend_html: str) -> None:
         """Show the scale of the colours."""

@@ -17,6 +17,7 @@ from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.viewer.messages import CurrentCamera, KeyframeInfo
 from taichi_mrf.viewer.scene.coloring import pale
+from taichi_mrf.viewer.scene.widgets import change
 
 FRUSTUM_M = 0.075
 """Distance of a frustum's picture from its camera, metres."""
@@ -106,6 +107,7 @@ class KeyframeLayer:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
+        self._root = scene.add_frame("/keyframes", show_axes=False)
         self.roster = ShownKeyframes()
         self.chosen: int | None = None
         self.gizmo: viser.TransformControlsHandle | None = None
@@ -114,7 +116,7 @@ class KeyframeLayer:
         # viser remembers each name that was ever removed, so names are used again.
         self._places: dict[int, int] = {}
         self._free_places: list[int] = []
-        self._pictures = True
+        self._pictures = self._path = True
 
     @property
     def keyframes(self) -> dict[int, KeyframeInfo]:
@@ -142,10 +144,13 @@ class KeyframeLayer:
             if each in self._places:
                 self._draw(self.keyframes[each])
 
-    def show_pictures(self, on: bool) -> None:
-        """Show the depth images in the frusta, or hide them."""
-        if on != self._pictures:
-            self._pictures = on
+    def show(self, keyframes: bool, pictures: bool, path: bool) -> None:
+        """Show or hide the frusta, the depth images in them, and the path with the current camera."""
+        change(self._root, visible=keyframes)
+        self._path = path
+        self._show_path()
+        if pictures != self._pictures:
+            self._pictures = pictures
             for id in list(self._places):
                 self._draw(self.keyframes[id])
 
@@ -153,11 +158,18 @@ class KeyframeLayer:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
         lines = self.roster.way_m()
         if len(lines):
-            draw_lines(self._scene, "/way", lines, _WAY)
+            draw_lines(self._scene, "/way", lines, _WAY, visible=self._path)
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
         self._outline("/camera", camera.T_world_camera, camera.camera, _WAY, thickness=3.0, enlarged=2.0)
+        self._show_path()
+
+    def _show_path(self) -> None:
+        for name in ("/way", "/camera"):
+            node = self._scene.get_handle_by_name(name)
+            if node is not None:
+                change(node, visible=self._path)
 
     def grab(self) -> viser.TransformControlsHandle:
         """Put a gizmo on the chosen keyframe. There must be one."""

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer, MeasuredPoints, SceneChange
-from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, LookName, Scale, Show, ViewOptions
+from taichi_mrf.viewer.scene.coloring import CHANGE_COLORS, Scale
 from taichi_mrf.viewer.scene.keyframe_layer import draw_lines, placement
 from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
+from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.viewer.scene.widgets import change
@@ -31,7 +32,6 @@ REST_S = 0.5
 _GAP_M = 0.5
 """Distance between the map and the baseline's map, in metres."""
 
-_POINTS_LABEL = "what the chosen keyframe measured, in the colours of its photo, or of depth"
 _POINT_SHARE = 0.25
 """Size of a measured point, in voxels."""
 
@@ -41,8 +41,8 @@ _LOWEST_SHARE = 0.02
 _SQUARES_ACROSS = 8
 """The ground has about so many squares along the map's longer side."""
 
-GROWING: tuple[LookName, LookName] = ("surface by height", "voxels by probability")
-"""A look, and the one that takes its place until the surface is there."""
+GROWING = "marginal probability"
+"""The colouring of voxels in the place of a surface by height, until it is there."""
 
 _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 _OUTLINE_COLOR = (120, 120, 120)
@@ -54,14 +54,14 @@ class MapScene:
     /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
-        self._server, self._hello = server, hello
+        self._server, self.hello = server, hello
         self.layers: dict[Layer, VoxelLayer] = {
             "map": VoxelLayer(server.scene, "/voxels", hello.voxel_size),
             "baseline": VoxelLayer(server.scene, "/baseline", hello.voxel_size),
         }
-        self.surface = SurfaceLayer(server.scene, "/surface", hello.voxel_size)
+        self.surface = SurfaceLayer(server.scene, "/surface", hello.voxel_size, self.layers["map"])
         self._voxels = server.scene.add_frame("/voxels", show_axes=False)
-        self._shows: Show = "voxels"
+        self._options = ViewOptions()
         self._measured: MeasuredPoints | None = None
         self._points: viser.PointCloudHandle | None = None
         self.changes: tuple[SceneChange, ...] = ()
@@ -80,17 +80,32 @@ class MapScene:
 
     @property
     def scale(self) -> Scale | None:
-        """The colour scale in use; None before anything was drawn."""
-        if self._look is None:
+        """The colour scale in use; None before anything was drawn, and while neither map is shown."""
+        if self._look is None or not (self._options.map or self.has_baseline):
             return None
-        if self._shows == "points":
-            return replace(self._look.scale, label=_POINTS_LABEL)
-        return self.surface.scale(self._look) if self.shows_surface else self._look.scale
+        return self.surface.scale if self.shows_surface else self._look.scale
 
     @property
     def shows_surface(self) -> bool:
         """True if the measured surface is shown in the place of voxels: not while the map grows."""
-        return self._shows == "surface" and self.surface.is_complete and not self.growing
+        options = self._options
+        drawn = options.map and options.draw_as == "surface"
+        return drawn and self.surface.is_complete and not self.growing
+
+    @property
+    def shows_voxels(self) -> bool:
+        """True if voxels of a map are shown."""
+        return self.has_baseline or (self._options.map and not self.shows_surface)
+
+    @property
+    def has_baseline(self) -> bool:
+        """True if there is a second map."""
+        return bool(self.layers["baseline"].store.chunks)
+
+    @property
+    def shows_changes(self) -> bool:
+        """True if something is marked that moves, appeared or left."""
+        return self._options.changes and bool(self.changes or self.layers["map"].dynamic_shown)
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
@@ -105,25 +120,28 @@ class MapScene:
         """How many of what is shown, or will be once everything has been sent, by name."""
         counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
         counts |= {"dynamic": self.layers["map"].dynamic_shown}
+        if self.shows_surface or not self._options.map:
+            counts |= {"map": 0, "dynamic": 0}
         if self.shows_surface:
-            counts |= {"map": 0, "dynamic": 0, "triangles": self.surface.triangles_shown}
-        if self._shows == "points":
-            points = 0 if self._measured is None else len(self._measured.points_m)
-            counts |= {"map": 0, "dynamic": 0, "points": points}
+            counts |= {"triangles": self.surface.triangles_shown}
+        if self._options.points and self._measured is not None:
+            counts |= {"points": len(self._measured.points_m)}
         return counts
 
     def points(self) -> NDArray[np.float64]:
         """Centres (n, 3) of all voxels of the map that are shown, in metres, world; of the surface its
         vertices."""
+        if not self._options.map:
+            return np.zeros((0, 3))
         return self.surface.points() if self.shows_surface else self.layers["map"].points()
 
     def seen_points(self) -> NDArray[np.float64]:
-        """Points (n, 3) of all that is seen of both maps, in metres, world."""
-        seen = self.points()
-        if self._shows == "points" and self._points is not None and self._measured is not None:
+        """Points (n, 3) of all that is seen of both maps, in metres, world; of the map if that is nothing."""
+        seen = [self.points(), self.layers["baseline"].points()]
+        if self._options.points and self._points is not None and self._measured is not None:
             turned = vtf.SO3(self._points.wxyz).apply(self._measured.points_m.astype(np.float64))
-            seen = turned + self._points.position
-        return np.concatenate([seen, self.layers["baseline"].points()])
+            seen.append(turned + self._points.position)
+        return np.concatenate(seen) if any(map(len, seen)) else self.layers["map"].points()
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
@@ -145,15 +163,15 @@ class MapScene:
         self._news_at = time.monotonic()
 
     def show_measured(self, measured: MeasuredPoints, T_world_camera: Pose) -> None:
-        """Show what a keyframe measured, at its pose; :meth:`flush` hides it unless that is the look."""
+        """Show what a keyframe measured, at its pose, if that is a layer that is shown."""
         self._measured = measured
         self._points = self._server.scene.add_point_cloud(
             "/measured",
             points=measured.points_m,
             colors=measured.colors,
-            point_size=_POINT_SHARE * self._hello.voxel_size,
+            point_size=_POINT_SHARE * self.hello.voxel_size,
             point_shape="circle",
-            visible=self._shows == "points",
+            visible=self._options.points,
         )
         self.move_measured(measured.keyframe, T_world_camera)
 
@@ -206,48 +224,47 @@ class MapScene:
         if waited is None or waited > 0:
             return False
         rested = time.monotonic() >= self._news_at + REST_S
-        self._shows = options.shows
-        if options.look == GROWING[0] and not self.shows_surface:
-            options = replace(options, look=GROWING[1])
-        look = look_of(options, self.store, up, self._hello.voxel_size)
+        self._options = options
+        first = ViewOptions()
+        as_first = (options.draw_as, options.color_by) == (first.draw_as, first.color_by)
+        if as_first and not (self.surface.is_complete and not self.growing):
+            options = replace(options, color_by=GROWING)
+        look = look_of(options, self.store, up, self.hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
         map_changed = everything or bool(self.layers["map"].changed)
         any_changed = map_changed or bool(self.layers["baseline"].changed)
         # A cut parts two maps: this one on its one side, the baseline's on the other.
-        both = bool(self.layers["baseline"].store.chunks)
+        both = self.has_baseline
         cuts: dict[Layer, Cut | None] = {"map": look.cut, "baseline": look.cut}
         if both and look.cut is not None:
             cuts["baseline"] = look.cut.other_side
+        if everything:
+            self.surface.outdate(self.surface.patches)
+        elif look.coloring.surface is None:
+            self.surface.outdate(self.layers["map"].changed)
         for name, layer in self.layers.items():
             layer.prepare(replace(look, cut=cuts[name]), everything, exactly=rested)
-        if everything:
-            self.surface.outdate()
         if self.shows_surface:
             self.surface.prepare(look)
         announce()
         with self._server.atomic():
             for layer in self.layers.values():
                 layer.send()
-            self._show_one(self.shows_surface)
+            self.surface.send(self.shows_surface)
+            change(self._voxels, visible=options.map and not self.shows_surface)
+            if self._points is not None:
+                change(self._points, visible=options.points)
             if map_changed:
                 self._draw_bricks(options.bricks)
-                self._draw_changes(options.color_by == "changes")
+                self._draw_changes(options.changes)
             if any_changed:
-                self._draw_cut(None if both else look.cut, crossed)
+                self._draw_cut(None if both or not options.free_space else look.cut, crossed)
                 self.layers["baseline"].place(np.zeros(3) if look.cut else self._baseline_m(up))
                 self._show_space(options, up)
                 self._draw_names(up, cuts if both else None)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
-
-    def _show_one(self, surface: bool) -> None:
-        """Show the surface in the place of voxels, or a keyframe's points, or voxels."""
-        points = self._shows == "points"
-        self.surface.send(surface)
-        change(self._voxels, visible=not (surface or points))
-        if self._points is not None:
-            change(self._points, visible=points)
 
     def _draw_changes(self, wanted: bool) -> None:
         """Draw boxes around what has appeared and left if they are ``wanted``."""
@@ -270,11 +287,11 @@ class MapScene:
             points = self.layers["map"].points()
             if len(points):
                 height_m = up[1] * float(np.quantile(up[1] * points[:, up[0]], _LOWEST_SHARE))
-                self.ground.show(*box, up, height_m - up[1] * 0.5 * self._hello.voxel_size)
+                self.ground.show(*box, up, height_m - up[1] * 0.5 * self.hello.voxel_size)
         change(self._server.scene.world_axes, visible=options.axes)
 
     def _draw_cut(self, cut: Cut | None, crossed: Iterable[NDArray[np.int32]]) -> None:
-        hello, scene = self._hello, self._server.scene
+        hello, scene = self.hello, self._server.scene
         if cut is None:
             scene.remove_by_name("/cut")
             return
@@ -287,7 +304,7 @@ class MapScene:
         if not wanted or not len(bricks):
             self._server.scene.remove_by_name("/bricks")
             return
-        lines = brick_edges(bricks) * BRICK * self._hello.voxel_size
+        lines = brick_edges(bricks) * BRICK * self.hello.voxel_size
         draw_lines(self._server.scene, "/bricks", lines, _OUTLINE_COLOR, thickness=1.0)
 
     def _draw_names(self, up: Up, cuts: Mapping[Layer, Cut | None] | None) -> None:
@@ -301,7 +318,7 @@ class MapScene:
                 continue
             cut = cuts[layer]
             if cut is not None:
-                ends[0 if cut.flipped else 1, cut.axis] = cut.plane * self._hello.voxel_size
+                ends[0 if cut.flipped else 1, cut.axis] = cut.plane * self.hello.voxel_size
             above = ends.mean(axis=0) + self.layers[layer].origin_m
             axis, sign = up
             above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()

@@ -1,5 +1,5 @@
-"""The measured surface in the scene: triangles, one mesh for each chunk, in exactly the
-colours of their vertices.
+"""The measured surface in the scene: triangles, one mesh for each chunk, in exactly the colours of their
+vertices.
 
 viser's own meshes have one colour, or light and shadow of its making. A glTF with KHR_materials_unlit has
 neither. Its colours still go through the tone mapping of three.js (ACES, after S. Hill), which is undone
@@ -8,15 +8,16 @@ here beforehand; they are floats, because bright colours lie beyond 1.
 
 import json
 import struct
+from collections.abc import Iterable
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import SurfacePatch, SurfaceView
-from taichi_mrf.viewer.scene.coloring import Scale, height_scale, std_colors, std_scale, voxel_colors
-from taichi_mrf.viewer.scene.voxel_layer import Look
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown
+from taichi_mrf.viewer.scene.coloring import Scale
+from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer
+from taichi_mrf.viewer.scene.voxel_store import Chunk, ChunkKey, Cut, Shown
 from taichi_mrf.viewer.scene.widgets import change
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -29,6 +30,9 @@ _FROM_FILM = np.array(
 )
 _EXPOSURE = 1 / 0.6
 
+_NEARLY_SAME = 0.999
+"""Cosine between the upward directions of two views: less, and the light comes from elsewhere."""
+
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
 
@@ -40,13 +44,16 @@ _Mesh = tuple[NDArray[np.int32], bytes]
 class SurfaceLayer:
     """Owns the scene nodes under ``prefix``."""
 
-    def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
-        self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
+    def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float, layer: VoxelLayer) -> None:
+        """``layer`` has the voxels behind the surface."""
+        self._scene, self._prefix, self._voxel_size, self._layer = scene, prefix, voxel_size, layer
         self._root = scene.add_frame(prefix, show_axes=False, visible=False)
         self.patches: dict[ChunkKey, SurfacePatch] = {}
         self._stale: set[ChunkKey] = set()
-        self._view: SurfaceView | None = None
-        self._scale: Scale | None = None
+        self.view: SurfaceView | None = None
+        """How to show it."""
+        self.scale: Scale | None = None
+        """That of what was prepared last."""
         self._prepared: dict[ChunkKey, _Mesh | None] = {}
         self._shown: dict[ChunkKey, NDArray[np.int32]] = {}
         """The triangles of each chunk that clients have."""
@@ -59,7 +66,7 @@ class SurfaceLayer:
     @property
     def is_complete(self) -> bool:
         """True if there is a surface, and all of it has been taken in."""
-        return self._view is not None and bool(self.patches)
+        return self.view is not None and bool(self.patches)
 
     @property
     def triangles_shown(self) -> int:
@@ -78,29 +85,20 @@ class SurfaceLayer:
     def take_view(self, view: SurfaceView) -> None:
         """Take in how to show the patches that were taken in before. One that differs little from the last
         changes nothing, so that an edit draws only what it changes."""
-        if self._view is None or not _is_like(self._view, view):
-            self._view = view
-            self.outdate()
+        if self.view is None or float(self.view.up @ view.up) < _NEARLY_SAME:
+            self.view = view
+            self.outdate(self.patches.keys())
 
-    def outdate(self) -> None:
-        """Draw everything again with the next :meth:`prepare`."""
-        self._stale |= self.patches.keys()
-
-    def scale(self, look: Look) -> Scale:
-        """The scale of its colours."""
-        if look.scale.color_by == "height" and self._view is not None:
-            return height_scale(self._view.range_m)
-        if look.scale.color_by != "uncertainty":
-            return look.scale
-        every = [np.zeros(0, np.float32), *(patch.std_m for patch in self.patches.values())]
-        return std_scale(np.concatenate(every))
+    def outdate(self, chunks: Iterable[ChunkKey]) -> None:
+        """Draw the patches of these chunks again with the next :meth:`prepare`."""
+        self._stale |= self.patches.keys() & set(chunks)
 
     def prepare(self, look: Look) -> None:
         """Make the meshes of the patches that have changed; :meth:`send` sends them."""
-        scale = self.scale(look)
-        if scale != self._scale:  # that of uncertainty and that of heights depend on all patches
-            self._scale = scale
-            self.outdate()
+        scale = self._scale_of(look)
+        if scale != self.scale:  # one of numbers of the surface's own depends on all patches
+            self.scale = scale
+            self.outdate(self.patches.keys())
         for key in sorted(self._stale):
             patch = self.patches.get(key)
             self._prepared[key] = None if patch is None else self._drawn(patch, look, scale)
@@ -124,7 +122,7 @@ class SurfaceLayer:
     def clear(self) -> None:
         """Remove everything from the scene."""
         self.patches.clear()
-        self._view = None
+        self.view = None
         self._stale.clear()
         self._prepared = dict.fromkeys(self._shown)
         self.send(visible=False)
@@ -152,28 +150,34 @@ class SurfaceLayer:
         kept = cut.keeps(patch.vertices_m[:, cut.axis] / self._voxel_size)
         return patch.triangles[kept[patch.triangles].all(axis=1)]
 
+    def _scale_of(self, look: Look) -> Scale:
+        """That of voxels unless the colours say something else of vertices."""
+        measure = look.coloring.surface
+        if measure is None or measure is look.coloring.voxels:
+            return look.scale
+        numbers = [measure.of(patch, patch.vertices_m @ look.up) for patch in self.patches.values()]
+        return measure.scale(np.concatenate(numbers or [np.zeros(0)]), look.heights_m)
+
     def _colors(self, patch: SurfacePatch, look: Look, scale: Scale) -> NDArray[np.uint8]:
-        view = self._view
+        view = self.view
         assert view is not None  # until then nothing is drawn
-        if scale.color_by == "uncertainty":
-            colors = std_colors(scale, patch.std_m)
-        else:
-            none = np.zeros(0, np.uint8)
-            shown = Shown(none, none.astype(np.int16), none, patch.colors)
-            colors = voxel_colors(scale, shown, patch.vertices_m @ view.up - view.floor_m)
+        known = patch if look.coloring.surface else self._behind(patch)
+        colors = scale.paint(known, patch.vertices_m @ look.up)
         if not look.shade:
             return colors
         lit = np.clip((patch.normals / 127.0) @ view.light, 0.0, 1.0)
         return (colors * (_DARKEST + (1 - _DARKEST) * lit)[:, None] + 0.5).astype(np.uint8)
 
+    def _behind(self, patch: SurfacePatch) -> Shown:
+        """The voxels half a side behind the vertices; at the end of the patch's chunk those inside."""
+        places = (
+            patch.vertices_m - self._corner_m(patch.chunk)
+        ) / self._voxel_size - 0.5 * patch.normals / 127.0
+        cells = np.clip(np.floor(places), 0, CHUNK_VOXELS - 1).astype(np.int64)
+        return self._layer.store.chunks.get(patch.chunk, Chunk()).voxels(cells)
+
     def _corner_m(self, key: ChunkKey) -> NDArray[np.float64]:
         return np.array(key) * (CHUNK_VOXELS * self._voxel_size)
-
-
-def _is_like(view: SurfaceView, other: SurfaceView) -> bool:
-    """True if colours by height are nearly the same."""
-    one, two = (np.array([each.floor_m, each.floor_m + each.range_m]) for each in (view, other))
-    return bool((np.abs(one - two) < 0.02 * view.range_m).all()) and float(view.up @ other.up) > 0.999
 
 
 def unlit_glb(

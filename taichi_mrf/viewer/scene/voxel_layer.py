@@ -6,25 +6,27 @@ yellow; unknown voxels are transparent, so that free and unknown space look diff
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.geometry.up import Up
+from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.coloring import (
+    COLORINGS,
     DYNAMIC_COLOR,
     SPACE_COLORS,
+    Coloring,
+    Ends,
     Scale,
-    ViewOptions,
     pale,
-    scale_of,
-    voxel_colors,
+    shaded,
 )
-from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
+from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore, facing
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
 FREE = (*SPACE_COLORS["free"], 110)
@@ -138,12 +140,27 @@ class Look:
 
     log_odds: float
     cut: Cut | None
+    coloring: Coloring
     scale: Scale
+    """That of voxels."""
+    heights_m: Ends = field(compare=False)
+    """The lowest and the highest of the map: what depends on them is in the scale."""
     point_size: float
     """In voxels."""
     shade: bool
-    up: tuple[int, int]
-    """The axis that points up, and 1 or -1 for its direction."""
+    changes: bool
+    up: tuple[float, ...]
+    """A unit vector in the world."""
+
+    def paint(
+        self, shown: Shown, centres: NDArray, voxel_size: float, first_m: ArrayLike, facing: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Colours (n, 3) of voxels whose surfaces face there, with centres (n, 3) in voxels from ``first_m``
+        (metres, world)."""
+        up_m = voxel_size * np.array(self.up, np.float32)
+        heights_m = centres.astype(np.float32) @ up_m + np.float32(np.dot(first_m, self.up))
+        colors = self.scale.paint(shown, heights_m)
+        return shaded(colors, facing) if self.shade else colors
 
 
 @dataclass
@@ -249,12 +266,10 @@ class VoxelLayer:
             if before is not None:
                 self._prepared[key] = None
             return
-        axis, sign = look.up
-        heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
-        faces = facing(shown.cells) if look.shade else None
-        colors = voxel_colors(look.scale, shown, heights, faces)
+        first_m = (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
+        colors = look.paint(shown, shown.cells, self._voxel_size, first_m, facing(shown.cells))
         colors[shown.is_earlier] = pale(colors[shown.is_earlier])
-        dynamic = self._is_dynamic(key, shown.cells)
+        dynamic = self._is_dynamic(key, shown.cells) & look.changes
         colors[dynamic] = DYNAMIC_COLOR
         now = _Sent(shown.cells, colors, look.point_size, int(dynamic.sum()))
         if before is not None and np.array_equal(before.cells, now.cells):
@@ -303,27 +318,26 @@ class VoxelLayer:
 
 
 def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
-    """How the voxels of a map look."""
+    """How the voxels of a map look; heights of the surface have the same range."""
+    log_odds = float(np.log(options.threshold / (1 - options.threshold)))
+    coloring = COLORINGS[options.color_by]
+    some, centres = store.sample(log_odds)
+    their_heights_m = voxel_size * centres @ up_vector(up)
+    heights_m = _ends(their_heights_m, 2 * voxel_size)
     return Look(
-        log_odds=float(np.log(options.threshold / (1 - options.threshold))),
+        log_odds=log_odds,
         cut=cut_of(options, store, up, voxel_size),
-        scale=scale_of(
-            options.color_by,
-            options.threshold,
-            _heights_m(store, up, voxel_size),
-            store.most_seen() if options.color_by == "keyframes" else 1,
-        ),
+        coloring=coloring,
+        scale=coloring.voxels.scale(coloring.voxels.of(some, their_heights_m), heights_m),
+        heights_m=heights_m,
         point_size=options.size,
         shade=options.shade,
-        up=up,
+        changes=options.changes,
+        up=tuple(up_vector(up).tolist()),
     )
 
 
-def _heights_m(store: VoxelStore, up: Up, voxel_size: float) -> tuple[float, float]:
-    """Heights of the lower side of the lowest brick and of the upper side of the highest, in metres."""
-    bounds = store.bounds()
-    if bounds is None:
-        return 0.0, 1.0
-    axis, sign = up
-    ends = sign * BRICK * voxel_size * np.array([bounds[0][axis], bounds[1][axis] + 1])
-    return float(ends.min()), float(ends.max())
+def _ends(heights_m: NDArray[np.float64], step_m: float) -> Ends:
+    """The lowest and the highest of some heights, in whole steps; stray ones do not count."""
+    floor_m, top_m = np.quantile(heights_m, [0.005, 0.995]) if len(heights_m) else (0.0, step_m)
+    return float(np.floor(floor_m / step_m)) * step_m, float(np.ceil(top_m / step_m)) * step_m

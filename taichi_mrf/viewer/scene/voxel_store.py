@@ -5,6 +5,7 @@ show, without the mapping process.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ ChunkKey = tuple[int, int, int]
 
 _IN_BRICK = offsets_in_brick().astype(np.uint8)
 _NOWHERE = -1
+_SAMPLED_CHUNKS, _SAMPLED_BRICKS, _SAMPLED = 256, 64, 256
+"""A sample of a map is of so many chunks at most, of so many bricks and then voxels of each."""
 _BITS = VOXELS.bit_length() - 1
 
 _LAYERS = {
@@ -49,6 +52,11 @@ class Shown:
     def is_earlier(self) -> NDArray[np.bool_]:
         """The voxels of an earlier map of which today's keyframes have said nothing, (n,)."""
         return np.zeros(len(self.cells), bool) if self.earlier is None else self.log_odds == self.earlier
+
+    def __getitem__(self, which: slice) -> "Shown":
+        """Some of the voxels."""
+        kept: Any = {name: each if each is None else each[which] for name, each in vars(self).items()}
+        return Shown(**kept)
 
 
 @dataclass(frozen=True)
@@ -130,15 +138,35 @@ class Chunk:
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
 
-    def at_least(self, log_odds: float, cut: Cut | None = None) -> Shown:
-        """The voxels of at least these log-odds that are not cut away; the ``cut`` counts from the chunk."""
-        every = {name: values.reshape(-1, *values.shape[2:]) for name, values in self.values.items()}
+    def at_least(
+        self, log_odds: float, cut: Cut | None = None, rows: slice | NDArray[np.intp] = slice(None)
+    ) -> Shown:
+        """The voxels of at least these log-odds that are not cut away, of all bricks or those in ``rows``;
+        the ``cut`` counts from the chunk."""
+        every = {name: each[rows].reshape(-1, *each.shape[2:]) for name, each in self.values.items()}
         voxels = np.flatnonzero(every[LOG_ODDS] >= np.ceil(log_odds / LOG_ODDS_STEP))
-        cells = _CELLS[self._codes.astype(np.int32)[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
+        codes = self._codes[rows].astype(np.int32)
+        cells = _CELLS[codes[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
         if cut is not None:
             kept = cut.keeps(cells[:, cut.axis] + 0.5)
             voxels, cells = voxels[kept], cells[kept]
         return Shown(cells, **{name: values[voxels] for name, values in every.items()})
+
+    def voxels(self, cells: NDArray[np.integer]) -> Shown:
+        """The voxels with coordinates (n, 3), 0 to 63; those that are not here have missing values."""
+        row = self._row[np.ravel_multi_index(tuple((cells // BRICK).T), (CHUNK,) * 3)]
+        number, here = np.ravel_multi_index(tuple((cells % BRICK).T), (BRICK,) * 3), row != _NOWHERE
+        found = {}
+        for name, values in self.values.items():
+            found[name] = _filled(name, len(cells))
+            found[name][here] = values[row[here], number[here]]
+        return Shown(cells.astype(np.uint8), **found)
+
+    def sample(self, log_odds: float) -> Shown:
+        """Some voxels of at least these log-odds, from all over the chunk; the same in whatever order its
+        bricks came."""
+        shown = self.at_least(log_odds, rows=np.argsort(self._codes)[:: _step(len(self), _SAMPLED_BRICKS)])
+        return shown[:: _step(len(shown.cells), _SAMPLED)]
 
     def voxel(self, cell: NDArray[np.integer]) -> tuple[int, NDArray[np.uint8] | None] | None:
         """The log-odds of a voxel with coordinates (3,), 0 to 63, and the colour that cameras saw, None if it
@@ -167,6 +195,7 @@ class VoxelStore:
     def __init__(self) -> None:
         self.chunks: dict[ChunkKey, Chunk] = {}
         self._bounds: dict[ChunkKey, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+        self._samples: dict[ChunkKey, tuple[float, Shown]] = {}
 
     def put(self, bricks: NDArray[np.int32], **values: NDArray) -> set[ChunkKey]:
         """Take in layers of bricks (n, 3) as :class:`messages.Bricks` and :class:`messages.BrickColors` bring
@@ -215,6 +244,7 @@ class VoxelStore:
     def _forget_bounds(self, changed: set[ChunkKey]) -> None:
         for key in changed:
             self._bounds.pop(key, None)
+            self._samples.pop(key, None)
 
     def bricks(self) -> NDArray[np.int64]:
         """World coordinates (n, 3) of all bricks."""
@@ -223,9 +253,25 @@ class VoxelStore:
             + [chunk.bricks + np.array(key, np.int64) * CHUNK for key, chunk in self.chunks.items()]
         )
 
-    def most_seen(self) -> int:
-        """The largest number of keyframes that see a voxel."""
-        return max((int(chunk.values["seen"].max(initial=0)) for chunk in self.chunks.values()), default=0)
+    def sample(self, log_odds: float) -> tuple[Shown, NDArray[np.float64]]:
+        """Some voxels of at least these log-odds, from all over the map; their centres (n, 3) in voxels."""
+        keys = sorted(self.chunks)[:: _step(len(self.chunks), _SAMPLED_CHUNKS)]
+        for key in keys:
+            if self._samples.get(key, (None,))[0] != log_odds:
+                self._samples[key] = log_odds, self.chunks[key].sample(log_odds)
+        found = [self._samples[key][1] for key in keys] or [Chunk().at_least(log_odds)]
+        values = {}
+        for name in _LAYERS:
+            each = [getattr(shown, name) for shown in found]
+            if any(part is not None for part in each):
+                filled = (_filled(name, len(shown.cells)) for shown in found)
+                values[name] = np.concatenate(
+                    [one if part is None else part for part, one in zip(each, filled, strict=True)]
+                )
+        corners = np.array(keys, np.float64).reshape(-1, 3) * CHUNK_VOXELS
+        many = [len(shown.cells) for shown in found]
+        cells = np.concatenate([shown.cells for shown in found])
+        return Shown(cells, **values), cells + 0.5 + (np.repeat(corners, many, axis=0) if keys else 0.0)
 
     def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
         """The voxels of a chunk with at least these log-odds that are not cut away; none if there is no such
@@ -238,10 +284,19 @@ class VoxelStore:
         return chunk.at_least(log_odds, cut)
 
 
+def _step(many: int, most: int) -> int:
+    """The step of a sample of ``many``. It is odd: even ones would skip planes of a brick."""
+    return -(-many // most) | 1
+
+
 def _missing(name: str, bricks: int) -> NDArray:
     """Values of a layer of so many bricks of which nothing is known."""
+    return _filled(name, bricks, VOXELS)
+
+
+def _filled(name: str, *shape: int) -> NDArray:
     layer = _LAYERS[name]
-    return np.full((bricks, VOXELS, *layer.shape), layer.missing, layer.dtype)
+    return np.full((*shape, *layer.shape), layer.missing, layer.dtype)
 
 
 def _by_chunk(

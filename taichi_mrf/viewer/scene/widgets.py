@@ -11,7 +11,7 @@ import html
 import string
 import typing
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
@@ -21,6 +21,8 @@ from taichi_mrf.config.text import field_help
 
 LONGEST = 1000
 """Characters of one text in markdown; the rest is cut off."""
+
+INDENT = "\N{EM SPACE}"
 
 _PUNCTUATION = {ord(c): f"&#{ord(c)};" for c in string.punctuation}
 _INVISIBLE = {"Cc", "Cf", "Cs", "Co", "Cn"}
@@ -48,21 +50,22 @@ T = TypeVar("T")
 
 
 class OptionWidgets(Generic[T]):
-    """One widget for each field of a dataclass: a slider for a number with a Range, a dropdown for a Literal,
-    a checkbox for a bool."""
+    """One widget for each field of a dataclass: a slider for a number with a Range, a dropdown for a Literal
+    or for names that are offered later, a checkbox for a bool."""
 
     def __init__(self, gui: viser.GuiApi, options: T, changed: Callable[[], None]) -> None:
         """``changed`` is called, on some thread, after any of the widgets was moved."""
         self._gui, self._options, self._changed = gui, options, changed
         self.handles: dict[str, Any] = {}
 
-    def add(self, *names: str) -> None:
+    def add(self, *names: str, indented: Container[str] = ()) -> None:
         """Add the widgets of these fields, of all without a name, at the place where the GUI stands."""
         cls: type[Any] = type(self._options)
         hints, texts = typing.get_type_hints(cls, include_extras=True), field_help(cls)
         for name in names or tuple(hints):
             value = getattr(self._options, name)
-            handle = add_widget(self._gui, label_of(name), hints[name], value, texts[name])
+            label = f"{INDENT if name in indented else ''}{label_of(name)}"
+            handle = add_widget(self._gui, label, hints[name], value, texts[name])
             handle.on_update(lambda event: self._changed())
             self.handles[name] = handle
 
@@ -93,12 +96,14 @@ def label_of(name: str) -> str:
 
 def add_widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:
     """The widget for a value of the type ``hint``, with ``text`` as its help: a slider for a number with a
-    Range, a dropdown for a Literal, a checkbox for a bool. Raises TypeError for any other type."""
+    Range, a dropdown for a Literal or a name, a checkbox for a bool. Raises TypeError for any other type."""
     if typing.get_origin(hint) is Annotated:
         limits = next(each for each in typing.get_args(hint) if isinstance(each, Range))
         return gui.add_slider(label, limits.least, limits.most, limits.step, value, hint=text)
     if typing.get_origin(hint) is Literal:
         return gui.add_dropdown(label, list(typing.get_args(hint)), initial_value=value, hint=text)
+    if hint is str:
+        return gui.add_dropdown(label, [value], initial_value=value, hint=text)
     if hint is bool:
         return gui.add_checkbox(label, value, hint=text)
     raise TypeError(f"no widget for {label}: {hint}")

@@ -5,6 +5,7 @@ only its own parameter.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import viser
 
@@ -85,6 +86,8 @@ class TunePage(BasePage[TunePanel]):
         """The old map stays until the first bricks of the new one arrive, or the scene would be empty."""
         self._hello = hello
         self.keyframes.clear()
+        self.panel.offer(replace(hello, counts_keyframes=False))  # these are not sent here
+        self.options = self.panel.view_options.value()
 
     def _take_bricks(self, bricks: m.Bricks) -> None:
         if self._hello is not None:
