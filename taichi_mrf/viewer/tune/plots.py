@@ -200,7 +200,8 @@ class NoiseCurves:
         try:
             of_depth = curves_of(sensor)
         except ConfigError as error:
-            return cls(_nowhere, in_markdown(f"The curves are not drawn: {error}."))
+            nothing = in_markdown(f"The curves are not drawn: {error}.")
+            return cls(lambda depth_m: (np.nan * depth_m[None],) * 2, nothing)
         if is_model(sensor.sigma_table):
             return cls(of_depth, "The curves are the mean of the noise model in force.")
         names = " and ".join(tables)
@@ -210,11 +211,6 @@ class NoiseCurves:
         """Bias and sigma at some depths, in metres, means over all patches; (n,) each."""
         sigma, bias = self.of_depth(depth_m)
         return bias.mean(axis=0), sigma.mean(axis=0)
-
-
-def _nowhere(depth_m: NDArray[np.float64]) -> Curves:
-    nothing = np.full((1, len(depth_m)), np.nan)
-    return nothing, nothing
 
 
 class NoisePlot:
