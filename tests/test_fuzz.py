@@ -18,12 +18,13 @@ from pathlib import Path
 
 import pytest
 from fuzz_damage import BYTES, PNG, TEXT, ZIP, Damage
-from fuzz_loaders import LOADERS, map_last_dataset
+from fuzz_loaders import LOADERS, RECORDINGS, map_last_dataset
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from inputs_bags import plain, write_bag
 
-from taichi_mrf.datasets.registry import open_dataset
+from taichi_mrf.datasets.entries import FORMATS
+from taichi_mrf.datasets.registry import format_name, open_dataset, plugs
 from taichi_mrf.errors import DatasetError, TaichiMRFError
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -138,14 +139,21 @@ def test_many_damaged_files_are_refused_or_read_rightly(name: str, root: Path, b
     ("name", "seed"),
     [
         ("map, MRFMap", 20682),  # a character beyond Unicode
-        ("TUM RGB-D", 21517),  # a file name of thousands of characters
-        ("TUM RGB-D", 22406),  # a folder's
+        ("tum", 21517),  # a file name of thousands of characters
+        ("tum", 22406),  # a folder's
         ("MCAP", 22624),  # a word for a number in the metadata
         ("mesh PLY", 20692),  # a word of thousands of characters, which the reader of meshes repeats
     ],
 )
 def test_what_once_went_wrong_is_refused(name: str, seed: int, root: Path) -> None:
     assert run_case(name, seed, root).kind == "refused"
+
+
+def test_every_format_of_recordings_is_damaged_here(root: Path) -> None:
+    written = {format_name(root / f"good {name}" / _good(name, root)[0]) for name in RECORDINGS}
+    by_a_library = {"Ouster", "LAS survey"}  # which not every machine has
+    missing = {each.name for each in (*plugs()[0], *FORMATS)} - written - by_a_library
+    assert not missing, f"write {missing} in FORMATS of tests/support/datasets_recordings.py"
 
 
 def test_an_index_that_points_to_another_topics_message_is_refused(tmp_path: Path) -> None:

@@ -50,8 +50,8 @@ class SensorConfig:
     """Mean of measured minus true depth in metres: coefficients in ascending powers of the true depth."""
 
     sigma_table: str | None = in_files(None)
-    """A .npy file of shape (patches, degree + 1) with a sigma polynomial for each pixel patch, row by row.
-    Overrides ``sigma``. A relative path starts at the YAML file's folder."""
+    """A .npy file (patches, degree + 1) with a sigma polynomial for each pixel patch, row by row, or the .npz
+    of a noise model. Overrides ``sigma``. A relative path starts at the YAML file's folder."""
 
     bias_table: str | None = in_files(None)
     """A .npy file of the same shape with a bias polynomial for each pixel patch. Overrides ``bias``."""

@@ -13,7 +13,7 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import BackendError, ConfigError, FrameError
-from taichi_mrf.sensor.noise import evaluate, patch_coefficients
+from taichi_mrf.sensor.noise import curves_of
 
 RIG = "stereo"
 """The shipped parameters of a stereo rig, whose sigma stands for one that is not known."""
@@ -161,7 +161,7 @@ def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
     least = SensorConfig().max_depth
     most = min(float(np.quantile(depths_m, 0.99)), FARTHEST_M) if depths_m.size else least
     tried = np.arange(least, max(most, least) + 0.5, 0.5)
-    sigma = np.median(evaluate(patch_coefficients(sensor)[0][:, None], tried), axis=0)
+    sigma = np.median(curves_of(sensor)(tried)[0], axis=0)
     worse = np.flatnonzero(sigma > USEFUL * tried)
     return float(np.rint(tried[max(0, worse[0] - 1)] if len(worse) else tried[-1]))
 

@@ -9,7 +9,7 @@ the map's origin is in the recorded world, unless that is 0.
 """
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -76,55 +76,38 @@ def export_map(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS
     """
     if not hasattr(m, "view"):
         raise ArgumentTypeError(f"m must be a map, or a part of one from take_part, not {shown(m)}")
-    return writer_of(path)(m, Path(path), options)
+    return _format_of(path).write(m, Path(path), options)
 
 
-def writer_of(path: str | Path) -> Writer:
-    """The function that writes a file of this name. Raises ConfigError for an unknown extension."""
+def _format_of(path: str | Path) -> "ExportFormat":
+    """The format of a file of this name. Raises ConfigError for an unknown extension."""
     suffix = Path(path).suffix.lower()
-    if suffix in _WRITERS:
-        return _WRITERS[suffix]
-    known = ", ".join(_WRITERS)
+    if suffix in FORMATS:
+        return FORMATS[suffix]
+    known = ", ".join(FORMATS)
     if not suffix:
         raise ConfigError(f"{path}: no file extension: cannot choose an export format; known are {known}")
-    near = difflib.get_close_matches(suffix, _WRITERS, 1, cutoff=0.0)[0]
+    near = difflib.get_close_matches(suffix, FORMATS, 1, cutoff=0.0)[0]
     raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
-
-
-_WITH_ORIGIN = (".ply", ".obj", ".pgm", ".yaml")
-"""Files that have coordinates of the recorded world, however far its origin is."""
 
 
 def require_libraries(path: str | Path) -> None:
     """Raises TaichiMRFError if the format of a file's extension needs a library that is not installed, and
     ConfigError for an unknown one."""
-    writer = writer_of(path)
-    if writer is _chunks:
-        library("zarr", "maps in chunks need", "store")
-    elif writer is _surface:
-        library("trimesh", f"{Path(path).suffix.lower()} files need", "mesh")
-    elif writer is _messages:
-        require_message_libraries(".mcap files need")
-    elif writer is _recording:
-        require_rerun()
-
-
-def extensions() -> Sequence[str]:
-    """The extensions of all formats."""
-    return tuple(_WRITERS)
+    _format_of(path).require(f"{Path(path).suffix.lower()} files need")
 
 
 def export_note(m: VoxelMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
     """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world, and that
     its coordinates are not the recording's, if that is so."""
-    origin, suffix = m.config.volume.origin, Path(path).suffix.lower()
-    local = any(origin) and suffix not in _WITH_ORIGIN
+    origin = m.config.volume.origin
+    local = any(origin) and not _format_of(path).in_world
     told = "its coordinates begin at {:.0f} {:.0f} {:.0f} of the recorded world".format(*origin)
     return "; ".join(filter(None, [_shown_note(m, path, options), told if local else None])) or None
 
 
 def _shown_note(m: VoxelMap, path: str | Path, options: ExportOptions) -> str | None:
-    writer = _WRITERS.get(Path(path).suffix.lower())
+    writer = _format_of(path).write
     if writer is _surface or (writer is _points_or_surface and options.mesh):
         if options.cubes or not METHODS[m.config.method].measures_surface:
             return None
@@ -320,21 +303,36 @@ def _page(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     return [path]
 
 
-_WRITERS: dict[str, Writer] = {
-    ".ply": _points_or_surface,
-    ".bt": _octomap_binary,
-    ".ot": _octomap,
-    ".glb": _surface,
-    ".obj": _surface,
-    ".stl": _surface,
-    ".pgm": _level_map,
-    ".yaml": _level_map,
-    ".mcap": _messages,
-    ".rrd": _recording,
-    ".npz": _arrays,
-    ".html": _page,
-    SUFFIX: _chunks,
+@dataclass(frozen=True)
+class ExportFormat:
+    """The entry of a format: what writes it, what raises TaichiMRFError if a library that it needs is not
+    installed, and whether it has coordinates of the recorded world, however far its origin is."""
+
+    write: Writer
+    require: Callable[[str], Any] = lambda who: None
+    in_world: bool = False
+
+
+def _trimesh(who: str) -> Any:
+    return library("trimesh", who, "mesh")
+
+
+FORMATS: dict[str, ExportFormat] = {
+    ".ply": ExportFormat(_points_or_surface, in_world=True),
+    ".bt": ExportFormat(_octomap_binary),
+    ".ot": ExportFormat(_octomap),
+    ".glb": ExportFormat(_surface, _trimesh),
+    ".obj": ExportFormat(_surface, _trimesh, in_world=True),
+    ".stl": ExportFormat(_surface, _trimesh),
+    ".pgm": ExportFormat(_level_map, in_world=True),
+    ".yaml": ExportFormat(_level_map, in_world=True),
+    ".mcap": ExportFormat(_messages, require_message_libraries),
+    ".rrd": ExportFormat(_recording, lambda who: require_rerun()),
+    ".npz": ExportFormat(_arrays),
+    ".html": ExportFormat(_page),
+    SUFFIX: ExportFormat(_chunks, lambda who: library("zarr", "maps in chunks need", "store")),
 }
+"""Every format by its extension."""
 
 
 def write_mesh(
@@ -361,7 +359,7 @@ def write_mesh(
             extra["std_m"] = surface.std_m
         write_surface(path, surface.vertices_m, surface.triangles, surface.colors, extra, comments, origin_m)
         return
-    trimesh = library("trimesh", f"{suffix} files need", "mesh")
+    trimesh = _trimesh(f"{suffix} files need")
     far = suffix == ".obj" and any(origin_m)
     vertices_m = surface.vertices_m.astype(np.float64) + origin_m if far else surface.vertices_m
     mesh = trimesh.Trimesh(

@@ -24,12 +24,10 @@ from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
-from taichi_mrf.sensor.distortion import DistortedCamera
-from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance
-from taichi_mrf.sensor.ray_table import RayTable
-from taichi_mrf.sensor.spherical import SphericalCamera
+from taichi_mrf.sensor.stored import is_stored, read_stored, stored_arrays
 from taichi_mrf.system.later import later
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
@@ -57,6 +55,7 @@ NUMBERS = "keyframe_camera_numbers"
 
 _CAMERA_ROWS = "keyframe_cameras"
 _CAMERA_ROW = 6
+_NOISE = "noise_"
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class MapHeader:
             "next_id": np.asarray(self.next_id),
             "settled": np.asarray(self.settled),
             "up": np.asarray(self.up_axis),
-            **noise_arrays(self.noise),
+            **stored_arrays(self.noise, _NOISE),
             **({} if self.promise is None else promise_arrays(self.promise)),
         }
         for number, keyframe in enumerate(keyframes):
@@ -222,7 +221,7 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     next_id = file.integers("next_id", (), 0, 2**53).item()
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: keyframe_ids are not valid below next_id, or not distinct")
-    config, noise = _config(path, file), read_noise(file)
+    config, noise = _config(path, file), read_stored(file, _NOISE)
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
     settled = file.scalar("settled", "b") if "settled" in file else True  # earlier versions did not save it
@@ -261,30 +260,6 @@ def _config(path: Path, file: NpzFile) -> Config:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
 
 
-def noise_arrays(noise: NoiseModel, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """A noise model as arrays by name. Raises MapFileError for one that cannot be saved."""
-    if isinstance(noise, PatchNoise):
-        arrays = noise.arrays()
-    elif isinstance(noise, PolynomialNoise):
-        arrays = {"sigma": noise.sigma, "bias": noise.bias}
-    else:
-        raise MapFileError(f"a noise model of type {type(noise).__name__} cannot be saved")
-    return {f"{prefix}noise_{name}": value for name, value in arrays.items()}
-
-
-def read_noise(file: NpzFile, prefix: str = "") -> NoiseModel:
-    """The noise model that :func:`noise_arrays` has made."""
-    prefix = f"{prefix}noise_"
-    with file.values_of(f"{prefix}sigma or {prefix}bias"):
-        if f"{prefix}patch" in file:
-            width, height, *rest = file.array(f"{prefix}camera", "fi", (6,)).tolist()
-            camera = PinholeCamera(int(width), int(height), *rest)
-            sigma, bias = (file.array(prefix + name, "f", (None, None)) for name in ("sigma", "bias"))
-            return PatchNoise(sigma, bias, file.scalar(f"{prefix}patch", "iu"), camera)
-        sigma, bias = (file.array(prefix + name, "f", (1, None))[0] for name in ("sigma", "bias"))
-        return PolynomialNoise(sigma, bias)
-
-
 _PROMISE = ("levels", "bound", "held_least", "held_most", "lost_m")
 
 
@@ -305,7 +280,7 @@ def read_promise(file: NpzFile) -> "FreePromise | None":
 
 def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
     """Arrays of the evidence that a keyframe states; none if it states nothing."""
-    arrays = {} if own.noise is None else noise_arrays(own.noise, prefix)
+    arrays = {} if own.noise is None else stored_arrays(own.noise, prefix + _NOISE)
     if own.sigma_m is not None:
         arrays[f"{prefix}sigma_m"] = own.sigma_m
     if own.no_return is not None:
@@ -317,7 +292,7 @@ def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
 
 def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
     """Evidence of a keyframe that :func:`evidence_arrays` has saved."""
-    noise = read_noise(file, prefix) if f"{prefix}noise_sigma" in file else None
+    noise = read_stored(file, prefix + _NOISE) if is_stored(file, prefix + _NOISE) else None
     sigma_m = None
     if f"{prefix}sigma_m" in file:
         sigma_m = file.array(f"{prefix}sigma_m", "f", camera.shape).astype(np.float32)
@@ -334,12 +309,12 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
 def camera_arrays(cameras: Sequence[Camera]) -> dict[str, NDArray]:
     """The cameras of keyframes as arrays by name. Raises MapFileError for one that cannot be saved."""
     if all(isinstance(camera, PinholeCamera) for camera in cameras):
-        rows = [_row(camera) for camera in cameras if isinstance(camera, PinholeCamera)]
-        return {_CAMERA_ROWS: np.array(rows, np.float64).reshape(-1, _CAMERA_ROW)}
+        rows = [camera.row for camera in cameras if isinstance(camera, PinholeCamera)]
+        return {_CAMERA_ROWS: np.array(rows).reshape(-1, _CAMERA_ROW)}
     distinct = {camera: number for number, camera in enumerate(dict.fromkeys(cameras))}
     arrays: dict[str, NDArray] = {NUMBERS: np.array([distinct[camera] for camera in cameras], np.int64)}
     for camera, number in distinct.items():
-        arrays |= {f"camera_{number}_{name}": values for name, values in _camera_arrays(camera).items()}
+        arrays |= stored_arrays(camera, f"camera_{number}_", "a keyframe's camera")
     return arrays
 
 
@@ -347,60 +322,9 @@ def read_cameras(file: NpzFile, keyframes: int) -> list[Camera]:
     """The cameras that :func:`camera_arrays` has saved, one for each keyframe. Raises the file's error."""
     if NUMBERS not in file:
         with file.values_of(_CAMERA_ROWS):
-            return [_pinhole(row) for row in file.array(_CAMERA_ROWS, "fi", (keyframes, _CAMERA_ROW))]
+            return [
+                PinholeCamera.of_row(row) for row in file.array(_CAMERA_ROWS, "fi", (keyframes, _CAMERA_ROW))
+            ]
     numbers = file.array(NUMBERS, "i", (keyframes,)).tolist()
-    distinct = {}
-    for number in dict.fromkeys(numbers):
-        with file.values_of(f"camera_{number}"):
-            distinct[number] = _read_camera(file, f"camera_{number}_")
+    distinct = {number: read_stored(file, f"camera_{number}_") for number in dict.fromkeys(numbers)}
     return [distinct[number] for number in numbers]
-
-
-def _camera_arrays(camera: Camera) -> dict[str, NDArray]:
-    if isinstance(camera, PinholeCamera):
-        return {"pinhole": np.array(_row(camera))}
-    if isinstance(camera, SphericalCamera):
-        return {
-            "elevations_rad": camera.elevations_rad,
-            "azimuths_rad": camera.azimuths_rad,
-            "azimuth_offsets_rad": camera.azimuth_offsets_rad,
-        }
-    if isinstance(camera, DistortedCamera):
-        return {"pinhole": np.array(_row(camera.pinhole)), "distortion": camera.coefficients}
-    if isinstance(camera, RayTable):
-        name = "directions" if camera.has_pattern else "free_directions"
-        if camera.origins_m is None:
-            return {name: camera.table}
-        # Another name, so that versions without origins do not read the directions alone.
-        return {f"moving_{name}": camera.table, "origins_m": camera.origins_m}
-    raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
-
-
-def _read_camera(file: NpzFile, prefix: str) -> Camera:
-    if f"{prefix}pinhole" in file:
-        pinhole = _pinhole(file.array(f"{prefix}pinhole", "f", (_CAMERA_ROW,)))
-        if f"{prefix}distortion" in file:
-            return DistortedCamera(pinhole, file.array(f"{prefix}distortion", "f", (None,)))
-        return pinhole
-    if f"{prefix}elevations_rad" in file:
-        names = ("elevations_rad", "azimuths_rad", "azimuth_offsets_rad")
-        return SphericalCamera(*(file.array(prefix + name, "f", (None,)) for name in names))
-    if f"{prefix}directions" in file:
-        return RayTable(file.array(f"{prefix}directions", "f", (None, None, 3)))
-    if f"{prefix}origins_m" not in file:
-        return RayTable(file.array(f"{prefix}free_directions", "f", (1, None, 3))[0])
-    if f"{prefix}moving_free_directions" in file:
-        free = (f"{prefix}moving_free_directions", f"{prefix}origins_m")
-        return RayTable(*(file.array(name, "f", (1, None, 3))[0] for name in free))
-    directions = file.array(f"{prefix}moving_directions", "f", (None, None, 3))
-    origins_m = file.array(f"{prefix}origins_m", "f", (None, None, 3))
-    return RayTable(directions, origins_m[0] if len(origins_m) == 1 else origins_m)
-
-
-def _row(camera: PinholeCamera) -> list[float]:
-    return [float(camera.width), camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-
-
-def _pinhole(row: NDArray[np.float64]) -> PinholeCamera:
-    width, height, *rest = row.tolist()
-    return PinholeCamera(int(width), int(height), *rest)

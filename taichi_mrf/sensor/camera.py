@@ -5,13 +5,14 @@ Kernels get their part of a camera from ``in_kernels``; importing this file does
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import instance, real, whole
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.sensor.stored import Arrays, Stored
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.rays import CameraRays
@@ -82,7 +83,7 @@ class Camera(Protocol):
 
 
 @dataclass(frozen=True)
-class PinholeCamera:
+class PinholeCamera(Stored):
     """An undistorted pinhole camera; all lengths in pixels.
 
     The ray of pixel (u, v) (column, row) goes through the pixel's centre, which has the coordinates (u, v): a
@@ -117,6 +118,24 @@ class PinholeCamera:
         if abs(K[1, 0]) > _NO_SKEW * abs(fx) or np.abs(K[2] - (0.0, 0.0, 1.0)).max() > _NO_SKEW:
             raise ConfigError("not the matrix of a pinhole camera: fx 0 cx / 0 fy cy / 0 0 1")
         return cls(width, height, fx, float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+
+    @classmethod
+    def of_row(cls, row: NDArray[np.number]) -> "PinholeCamera":
+        """The camera of :attr:`row`."""
+        width, height, *rest = row.tolist()
+        return cls(int(width), int(height), *rest)
+
+    @property
+    def row(self) -> NDArray[np.float64]:
+        """Width, height, fx, fy, cx, cy, as files hold them."""
+        return np.array([self.width, self.height, self.fx, self.fy, self.cx, self.cy], np.float64)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"pinhole": self.row}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "PinholeCamera":
+        return cls.of_row(file.array("pinhole", "f", (6,)))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.stored import Arrays
 
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV takes."""
@@ -65,6 +66,13 @@ class DistortedCamera(RayTable):
     def coefficients(self) -> NDArray[np.float64]:
         """OpenCV's coefficients, as they were given."""
         return self._coefficients.copy()
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {**self.pinhole.arrays(), "distortion": self._coefficients}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "DistortedCamera":
+        return cls(PinholeCamera.of_arrays(file), file.array("distortion", "f", (None,)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return DistortedCamera, (self.pinhole, self._coefficients)

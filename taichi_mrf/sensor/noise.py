@@ -19,6 +19,7 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
+from taichi_mrf.sensor.stored import Arrays, Stored, read_stored
 from taichi_mrf.system.later import later
 
 if TYPE_CHECKING:
@@ -32,6 +33,10 @@ else:
 UNBIASED_STEPS = 5
 """Fixed-point steps from a measurement to the depth that gives it. Where the bias changes by less than a
 fifth of a metre in a metre, less than a thousandth of it is left."""
+
+
+Curves = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""sigma (at least LEAST_SIGMA_M) and bias at depths (n,), a row for each kind of pixel."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +57,6 @@ class NoiseTable:
         row = (v // self.patch) * self.columns + u // self.patch
         sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
         return np.maximum(sigma, LEAST_SIGMA_M), bias
-
-    def at_pixel(self, column: int, row: int, depth_m: float) -> tuple[float, float]:
-        """sigma and bias of one pixel for a surface at a depth."""
-        patch = (row // self.patch) * self.columns + column // self.patch
-        sigma, bias = (float(evaluate(self.coefficients[patch, which], depth_m)) for which in (0, 1))
-        return max(sigma, LEAST_SIGMA_M), bias
 
     def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The largest sigma and the largest absolute bias that any pixel has at each of some depths, (N,)."""
@@ -90,7 +89,22 @@ class NoiseModel(Protocol):
         """The noise of one camera's pixels. Raises ConfigError if the model does not fit the camera."""
 
 
-class PolynomialNoise:
+class StoredNoise(Stored):
+    """The base of noise models that map files hold, and parameter files name (``sensor.sigma_table``)."""
+
+    sigma: NDArray[np.float64]
+    bias: NDArray[np.float64]
+
+    def table(self, camera: Camera) -> NoiseTable:
+        """As NoiseModel has it."""
+        raise NotImplementedError
+
+    def curves(self, depth_m: NDArray[np.float64]) -> Curves:
+        """What pictures show at depths (n,) in metres: here of (patches, TERMS) coefficients."""
+        return _curves(self.sigma, self.bias, depth_m)
+
+
+class PolynomialNoise(StoredNoise):
     """One bias and sigma for every pixel, as polynomials of axial depth."""
 
     def __init__(self, sigma: Sequence[float], bias: Sequence[float] = (0.0,)) -> None:
@@ -102,8 +116,15 @@ class PolynomialNoise:
         """One patch that covers the image, whatever the camera."""
         return _table(self.sigma, self.bias, max(camera.width, camera.height), 1)
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"sigma": self.sigma, "bias": self.bias}
 
-class PatchNoise:
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "PolynomialNoise":
+        return cls(*(file.array(name, "f", (1, None))[0] for name in ("sigma", "bias")))
+
+
+class PatchNoise(StoredNoise):
     """Learnt bias and sigma for each square patch of pixels of one camera."""
 
     def __init__(self, sigma: ArrayLike, bias: ArrayLike, patch: int, camera: Camera) -> None:
@@ -132,19 +153,20 @@ class PatchNoise:
         """Read the ``noise.npz`` that ``taichi-mrf calibrate`` writes: ``sigma``, ``bias``, ``patch``, and
         ``camera`` (width, height, fx, fy, cx, cy). Raises ConfigError, which names the file.
         """
-        with npz_file.open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
-            width, height, *intrinsics = file.array("camera", "fiu", (6,)).tolist()
-            sigma, bias = (file.array(name, "fiu", (None, None)) for name in ("sigma", "bias"))
-            patch = file.scalar("patch", "iu")
-        try:
-            return cls(sigma, bias, patch, PinholeCamera(round(width), round(height), *intrinsics))
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from error
+        found = load_noise(path)
+        if not isinstance(found, cls):
+            raise ConfigError(f"{path}: holds a {type(found).__name__}, not a {cls.__name__}")
+        return found
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "PatchNoise":
+        camera = PinholeCamera.of_row(file.array("camera", "fiu", (6,)))
+        sigma, bias = (file.array(name, "fiu", (None, None)) for name in ("sigma", "bias"))
+        return cls(sigma, bias, file.array("patch", "iu", ()).item(), camera)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays that :meth:`load` reads, by name. Raises ConfigError for a camera that is no pinhole."""
-        k = pinhole(self.camera, "a file of noise tables")
-        camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy], np.float64)
+        camera = pinhole(self.camera, "a file of noise tables").row
         return {"sigma": self.sigma, "bias": self.bias, "patch": np.array(self.patch), "camera": camera}
 
     def table(self, camera: Camera) -> NoiseTable:
@@ -156,8 +178,39 @@ class PatchNoise:
         return _table(self.sigma, self.bias, self.patch, self.columns)
 
 
+def load_noise(path: str | Path) -> StoredNoise:
+    """The noise model of an .npz with its ``stored_arrays``. Raises ConfigError, which names the file."""
+    with npz_file.open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
+        found = read_stored(file)
+    if not isinstance(found, StoredNoise):
+        raise ConfigError(f"{path}: holds a {type(found).__name__}, which is no noise model")
+    return found
+
+
+def curves_of(config: SensorConfig) -> Callable[[NDArray[np.float64]], Curves]:
+    """:meth:`StoredNoise.curves` of the noise that a configuration describes, whose files are read once.
+    Raises ConfigError naming field and file."""
+    if is_model(config.sigma_table):
+        return _stored_model(config).curves
+    sigma, bias = patch_coefficients(config)
+    return lambda depth_m: _curves(sigma, bias, depth_m)
+
+
+def is_model(table: str | None) -> bool:
+    """True if ``sigma_table`` names the file of a whole noise model, not of polynomials."""
+    return table is not None and Path(table).suffix == ".npz"
+
+
+def _stored_model(config: SensorConfig) -> Any:
+    if config.bias_table is not None:
+        raise ConfigError(f"sensor.bias_table: leave it out, {config.sigma_table} holds a bias of its own")
+    return widened_noise(load_noise(str(config.sigma_table)), config)
+
+
 def noise_from_config(config: SensorConfig, camera: Camera) -> NoiseModel:
     """The noise model that a configuration describes. Raises ConfigError naming field and file."""
+    if is_model(config.sigma_table):
+        return _stored_model(config)
     sigma, bias = patch_coefficients(config)
     if config.sigma_table is None and config.bias_table is None:
         return PolynomialNoise(sigma[0].tolist(), bias[0].tolist())
@@ -228,6 +281,11 @@ def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[
     for term in range(coefficients.shape[-1] - 1, -1, -1):
         value = value * depth + coefficients[..., term]
     return value
+
+
+def _curves(sigma: NDArray[np.float64], bias: NDArray[np.float64], depth_m: NDArray[np.float64]) -> Curves:
+    values, means = (evaluate(rows[:, None, :], depth_m) for rows in (sigma, bias))
+    return np.maximum(values, LEAST_SIGMA_M), means
 
 
 def without_bias(depth_m: NDArray[np.floating], table: NoiseTable) -> NDArray[np.float64]:

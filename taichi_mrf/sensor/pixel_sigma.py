@@ -30,10 +30,6 @@ class ScaledNoiseTable(NoiseTable):
         sigma, bias = super().at_pixels(depth_m)
         return np.maximum(sigma * self.scale, LEAST_SIGMA_M), bias
 
-    def at_pixel(self, column: int, row: int, depth_m: float) -> tuple[float, float]:
-        sigma, bias = super().at_pixel(column, row, depth_m)
-        return max(sigma * float(self.scale[row, column]), LEAST_SIGMA_M), bias
-
     def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         sigma, bias = super().largest(depth_m)
         return np.maximum(sigma * float(self.scale.max(initial=1.0)), LEAST_SIGMA_M), bias

@@ -12,6 +12,7 @@ from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import origins_of, turned
+from taichi_mrf.sensor.stored import Arrays, Stored
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.rays import TableRays
@@ -83,7 +84,7 @@ _SHORTEST = 1e-6
 """No direction is shorter than this."""
 
 
-class RayTable:
+class RayTable(Stored):
     """A camera given by one ray for each pixel (camera.Camera). It is immutable, and equals every other table
     with the same rays.
 
@@ -226,6 +227,24 @@ class RayTable:
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        name = "directions" if self.has_pattern else "free_directions"
+        if self._origins is None:
+            return {name: self._table}
+        # Another name, so that versions without origins do not read the directions alone.
+        return {f"moving_{name}": self._table, "origins_m": self._origins}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "RayTable":
+        moving = "moving_" if "origins_m" in file else ""
+        has_pattern = f"{moving}directions" in file
+        name, height = (f"{moving}directions", None) if has_pattern else (f"{moving}free_directions", 1)
+        directions = file.array(name, "f", (height, None, 3))
+        origins_m = file.array("origins_m", "f", (height, None, 3)) if moving else None
+        if origins_m is not None and len(origins_m) == 1:
+            origins_m = origins_m[0]
+        return RayTable(directions if has_pattern else directions[0], origins_m)
 
     def __reduce__(self) -> tuple[Any, ...]:
         directions = self._table if self.has_pattern else self._table[0]

@@ -8,6 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.stored import Arrays
+
+_BEAMS = "elevations_rad", "azimuths_rad", "azimuth_offsets_rad"
 
 
 class SphericalCamera(RayTable):
@@ -58,6 +61,13 @@ class SphericalCamera(RayTable):
     def azimuth_offsets_rad(self) -> NDArray[np.float64]:
         """Angle that each row adds to the azimuths, (H,)."""
         return self._beams[2].copy()
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return dict(zip(_BEAMS, self._beams, strict=True))
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "SphericalCamera":
+        return cls(*(file.array(name, "f", (None,)) for name in _BEAMS))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SphericalCamera, self._beams

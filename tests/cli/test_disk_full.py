@@ -14,7 +14,7 @@ from full_disk import files_up_to
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.evaluation.tables import Table, write_table
-from taichi_mrf.export.formats import export_map, extensions
+from taichi_mrf.export.formats import FORMATS, export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.system.atomic import write_text
@@ -46,7 +46,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("extension", extensions())
+@pytest.mark.parametrize("extension", FORMATS)
 def test_every_export(m: MRFMap, tmp_path: Path, extension: str) -> None:
     refused(lambda: export_map(m, tmp_path / f"map{extension}", LEVEL), tmp_path)
 

@@ -18,7 +18,7 @@ from console import carry_out
 from queried_maps import hand_map, map_of, room_map
 
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.formats import export_map, export_note, extensions
+from taichi_mrf.export.formats import FORMATS, export_map, export_note
 from taichi_mrf.export.map_server import level_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -85,7 +85,7 @@ def test_the_folder_of_a_file_is_made(saved: dict[str, Path], tmp_path: Path) ->
 def test_all_formats_of_a_saved_map(
     saved: dict[str, Path], method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names = [f"map{extension}" for extension in extensions() if extension != ".yaml"]
+    names = [f"map{extension}" for extension in FORMATS if extension != ".yaml"]
     files = [tmp_path / name for name in names]
     assert run_export(saved[method], "--to", *files, "--z-min=-0.9", "--z-max", "0.3", "--json") == 0
     report = json.loads(capsys.readouterr().out)
@@ -250,7 +250,7 @@ def test_the_map_is_not_overwritten(saved: dict[str, Path]) -> None:
     assert saved["log_odds"].read_bytes() == before
 
 
-@pytest.mark.parametrize("extension", [e for e in extensions() if e != ".yaml"])
+@pytest.mark.parametrize("extension", [e for e in FORMATS if e != ".yaml"])
 def test_a_file_that_cannot_be_written(extension: str, tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match="cannot be written"):
         export_map(room_map("mrf"), tmp_path / "absent" / f"map{extension}", ExportOptions(**BAND))

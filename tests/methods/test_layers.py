@@ -13,7 +13,7 @@ from console import carry_out
 from taichi_mrf.cli.info import map_facts
 from taichi_mrf.config.arguments import ArgumentTypeError
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.export.formats import export_map, extensions
+from taichi_mrf.export.formats import FORMATS, export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -83,7 +83,7 @@ def test_layers_that_there_are_not() -> None:
 def test_every_format_of_a_layer(tmp_path: Path) -> None:
     m, options = room_that_changed(ball_comes=True), ExportOptions(z_min=-2.0, z_max=2.0)
     layer = m.dynamic
-    for extension in extensions():
+    for extension in FORMATS:
         assert export_map(layer, tmp_path / f"map{extension}", options)
     for extension in (".html", ".ot"):
         assert export_map(m.static, tmp_path / f"static{extension}", options)  # has cells of several voxels

@@ -8,7 +8,7 @@ from pages import code_of
 from queried_maps import room_map
 
 import taichi_mrf
-from taichi_mrf.export.formats import extensions
+from taichi_mrf.export.formats import FORMATS
 from taichi_mrf.methods.mrf.reading import Layer
 
 
@@ -50,4 +50,4 @@ def test_the_examples_run_on_every_layer(
 
 def test_the_table_names_every_format(page: str) -> None:
     table = "\n".join(line for line in page.splitlines() if line.startswith("|"))
-    assert all(f"`{extension}" in table for extension in extensions())
+    assert all(f"`{extension}" in table for extension in FORMATS)

@@ -46,9 +46,6 @@ def test_sigma_holds_at_the_measured_depth_follows_the_models_law_and_leaves_the
     largest, _ = table.largest(np.array([1.0, 4.0]))
     for bound, z in zip(largest, (1.0, 4.0), strict=True):
         assert bound >= table.at_pixels(np.full(CAMERA.shape, z))[0].max()
-    s, b = table.at_pixel(13, 4, 2.0)
-    every = table.at_pixels(np.full(CAMERA.shape, 2.0))
-    assert (s, b) == pytest.approx((every[0][4, 13], every[1][4, 13]), rel=1e-6)
 
 
 @kernel

@@ -20,23 +20,18 @@ import numpy as np
 from bag_clouds import write as write_clouds
 from datasets_recordings import (
     CAMERA,
+    FORMATS,
     INTRINSIC,
     Content,
     arrays,
     column_by_column,
     stamped_line,
-    write_icl,
     write_image,
-    write_nerfstudio,
     write_npz,
     write_numbered,
     write_record3d,
-    write_redwood,
-    write_replica,
-    write_scannet,
     write_seven_scenes,
     write_stray,
-    write_tum,
 )
 from inputs_bags import Bag, plain, write_bag
 from laser_logs import ODOMETRY, flaser, robotlaser
@@ -480,16 +475,10 @@ K_TXT = "14 0 7.5\n0 15 5.5\n0 0 1"
 CAMERA_YAML = "width: 16\nheight: 12\nfx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\n"
 
 LOADERS = [
-    Loader("7-Scenes", _of(write_seven_scenes), _dataset),
+    *(Loader(name, _of(each.write, "recording"), _dataset) for name, each in FORMATS.items()),
     Loader("7-Scenes, camera.yaml", partial(_with_camera, "camera.yaml", CAMERA_YAML), _dataset),
     Loader("7-Scenes, intrinsics.txt", partial(_with_camera, "intrinsics.txt", K_TXT), _dataset),
-    Loader("TUM RGB-D", _of(write_tum), _dataset),
-    Loader("Redwood .log", _of(write_redwood), _dataset),
-    Loader("ICL-NUIM .freiburg", _of(write_icl), _dataset),
     Loader("Open3D JSON", _open3d, _dataset),
-    Loader("ScanNet", _of(write_scannet), _dataset),
-    Loader("Replica", lambda folder: write_replica(folder, CONTENT, "."), _dataset),
-    Loader("nerfstudio", _of(write_nerfstudio), _dataset),
     Loader("Stray Scanner", _of(write_stray), _dataset),
     Loader("Record3D", _record3d, _dataset),
     Loader("Record3D .r3d", _of(write_record3d, "walk.r3d"), _dataset),
@@ -539,3 +528,5 @@ LOADERS = [
     Loader("depth stack npz", partial(_stack, ".npz"), _depth_images, sealed=True),
     Loader("mesh PLY", _ply, _mesh),
 ]
+
+RECORDINGS = [loader.name for loader in LOADERS if loader.read is _dataset]

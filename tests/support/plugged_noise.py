@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from taichi_mrf.kernels.resident import resident
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.noise import Curves, StoredNoise
 from taichi_mrf.sensor.polynomials import SensorNoise
+from taichi_mrf.sensor.stored import Arrays
 from taichi_mrf.system.compiler import ti
 
 # ruff: noqa: ANN201, ANN202 - Taichi does not allow `-> None` on a kernel or a func.
@@ -51,7 +53,7 @@ class PixelSigmas(SensorNoise):
 
 
 @dataclass(frozen=True)
-class PixelNoise:
+class PixelNoise(StoredNoise):
     """A noise model with a sigma for each pixel, (H, W) metres, and perhaps another law of measurements."""
 
     sigma_m: NDArray[np.float32]
@@ -69,6 +71,17 @@ class PixelNoise:
     def sensor(self, camera: Any) -> Sensor:
         sigmas = PixelSigmas(resident(self.sigma_m.reshape(-1)), camera.width)
         return self.law(camera.in_kernels(), sigmas)
+
+    def curves(self, depth_m: NDArray[np.float64]) -> Curves:
+        sigma = np.repeat(self.sigma_m.reshape(-1, 1).astype(np.float64), depth_m.size, axis=1)
+        return sigma, np.zeros(sigma.shape)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"sigma_m": self.sigma_m}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "PixelNoise":
+        return cls(file.array("sigma_m", "f", (None, None)))
 
 
 @dataclass(frozen=True)

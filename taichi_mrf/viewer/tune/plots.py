@@ -4,7 +4,7 @@ of bias and sigma.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from viser import uplot
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.text import field_help
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
+from taichi_mrf.sensor.noise import Curves, curves_of, is_model
 from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
 from taichi_mrf.viewer.tune.messages import KINDS, Residuals, ScoreKind, Scores, Tried, Verdict, headline
 
@@ -184,11 +184,10 @@ _SERIES = (
 
 @dataclass(frozen=True)
 class NoiseCurves:
-    """The current bias and sigma: coefficients in ascending powers of depth, a row for each patch of an
-    image. ``note`` (markdown) says where they come from, if not from the page's own sliders."""
+    """The current sigma and bias at depths. ``note`` (markdown) says where they come from, if not from the
+    page's own sliders."""
 
-    sigma: NDArray[np.float64]
-    bias: NDArray[np.float64]
+    of_depth: Callable[[NDArray[np.float64]], Curves]
     note: str = ""
 
     @classmethod
@@ -197,21 +196,21 @@ class NoiseCurves:
         drawn."""
         tables = [name for name in ("sigma", "bias") if getattr(sensor, f"{name}_table") is not None]
         if not tables:
-            return cls(*patch_coefficients(sensor))
+            return cls(curves_of(sensor))
         try:
-            coefficients = patch_coefficients(sensor)
+            of_depth = curves_of(sensor)
         except ConfigError as error:
-            nowhere = np.full((1, 1), np.nan)
-            return cls(nowhere, nowhere, in_markdown(f"The curves are not drawn: {error}."))
+            nothing = in_markdown(f"The curves are not drawn: {error}.")
+            return cls(lambda depth_m: (np.nan * depth_m[None],) * 2, nothing)
+        if is_model(sensor.sigma_table):
+            return cls(of_depth, "The curves are the mean of the noise model in force.")
         names = " and ".join(tables)
-        return cls(
-            *coefficients, f"For {names} the curves are the mean over the patches of the table in force."
-        )
+        return cls(of_depth, f"For {names} the curves are the mean over the patches of the table in force.")
 
     def at(self, depth_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Bias and sigma at some depths, in metres, means over all patches; (n,) each."""
-        bias, sigma = (evaluate(rows[:, None, :], depth_m) for rows in (self.bias, self.sigma))
-        return bias.mean(axis=0), np.maximum(sigma, LEAST_SIGMA_M).mean(axis=0)
+        sigma, bias = self.of_depth(depth_m)
+        return bias.mean(axis=0), sigma.mean(axis=0)
 
 
 class NoisePlot:

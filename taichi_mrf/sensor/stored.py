@@ -1,0 +1,98 @@
+"""Cameras and noise models in files: each class gives its arrays, and is made of them again."""
+
+from collections.abc import Iterable
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import MapFileError
+
+if TYPE_CHECKING:
+    from taichi_mrf.system.npz_file import NpzFile
+
+KINDS: dict[str, type["Stored"]] = {}
+"""Every class that can be stored by its name, from the moment at which its module is imported."""
+
+StoredT = TypeVar("StoredT", bound="Stored")
+
+
+class Stored:
+    """The base of cameras and noise models that files can hold."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        KINDS[cls.__name__] = cls
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that :meth:`of_arrays` needs, by name. A subclass that does not write its own is read again as
+        its base."""
+        raise NotImplementedError
+
+    @classmethod
+    def of_arrays(cls: type[StoredT], file: "Arrays") -> StoredT:
+        """The same again. Raises the errors of the class's constructor, and the file's for wrong arrays."""
+        raise NotImplementedError
+
+
+class Arrays:
+    """Some arrays of an open file: those whose names begin with ``prefix``, which is left out here."""
+
+    def __init__(self, file: "NpzFile", prefix: str) -> None:
+        self._file, self._prefix = file, prefix
+
+    def __contains__(self, name: str) -> bool:
+        return self._prefix + name in self._file
+
+    def array(self, name: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+        """As NpzFile has it."""
+        return self._file.array(self._prefix + name, kinds, shape)
+
+
+_KIND = "kind"
+
+_TOLD_BY = {
+    "distortion": "distortion:DistortedCamera",
+    "pinhole": "camera:PinholeCamera",
+    "elevations_rad": "spherical:SphericalCamera",
+    "patch": "noise:PatchNoise",
+    "sigma": "noise:PolynomialNoise",
+}
+"""Files of earlier versions name no classes: these arrays tell them, and any others are rays."""
+
+
+def stored_arrays(thing: object, prefix: str = "", what: str = "a noise model") -> dict[str, NDArray[Any]]:
+    """A camera or a noise model as arrays by name. Raises MapFileError for one that cannot be saved."""
+    if not isinstance(thing, Stored):
+        name = type(thing).__name__
+        raise MapFileError(f"{what} of type {name} cannot be saved: its class has not the base Stored")
+    arrays = thing.arrays()
+    if type(thing).arrays is not _told(arrays).arrays:
+        arrays = {**arrays, _KIND: np.asarray(type(thing).__name__)}
+    return {prefix + name: values for name, values in arrays.items()}
+
+
+def is_stored(file: "NpzFile", prefix: str) -> bool:
+    """True if a file holds a noise model under these names."""
+    return f"{prefix}sigma" in file or prefix + _KIND in file
+
+
+def read_stored(file: "NpzFile", prefix: str = "") -> Any:
+    """What :func:`stored_arrays` has made. Raises the file's error."""
+    found = Arrays(file, prefix)
+    with file.values_of(prefix.rstrip("_") or "the noise"):
+        if _KIND not in found:
+            return _told(name for name in _TOLD_BY if name in found).of_arrays(found)
+        name = found.array(_KIND, "U", ()).item()
+        if name not in KINDS:
+            raise MapFileError(f"its class {name} is not loaded: import the module that defines it first")
+        return KINDS[name].of_arrays(found)
+
+
+def _told(names: Iterable[str]) -> type[Stored]:
+    """The class that arrays of these names tell."""
+    held = set(names)
+    place = next((place for name, place in _TOLD_BY.items() if name in held), "ray_table:RayTable")
+    found: type[Stored] = resolve_name(f"taichi_mrf.sensor.{place}")
+    return found
