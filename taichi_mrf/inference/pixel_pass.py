@@ -163,9 +163,9 @@ class VoxelSums:
         """Bytes of the sums."""
         return 8 * int(self.sums.shape[0])
 
-    def add_keyframe(self, slots: Resident, given: "ti.Ndarray") -> None:
-        """Add what a keyframe gives (n * 512 * words) to the bricks in ``slots`` (n)."""
-        _add_all(slots, given, self.sums, self._words, strip_length())
+    def take(self, slots: Resident, given: "ti.Ndarray") -> None:
+        """Add what a keyframe gives (n * 512 * words) to the bricks in ``slots`` (n), and leave 0 of it."""
+        _take_all(slots, given, self.sums, self._words, strip_length())
 
     def add(self, share: "VoxelShare", slots: NDArray[np.int32]) -> None:
         """Add what keyframes have left in some voxels; ``slots`` (n,) are the places of their bricks."""
@@ -180,12 +180,13 @@ class PixelPass:
     def __init__(self, sweeper: Sweeper, made: FromPixels) -> None:
         self._sweeper, self._made, self._visitor = sweeper, made, made.load_visitor()
         self._words = len(made.words)
-        self._sums = ti.ndarray(ti.i64, VOXELS * self._words)
+        self._sums, self._clean = ti.ndarray(ti.i64, VOXELS * self._words), False  # clean: all 0
 
     def add(self, keyframe: Keyframe, pool: BrickPool, sums: VoxelSums) -> None:
         """Add what a keyframe gives. Its bricks and messages must be up to date."""
         if self._spread(keyframe, pool):
-            sums.add_keyframe(keyframe.visible.on_device().slots, self._sums)
+            sums.take(keyframe.visible.on_device().slots, self._sums)
+            self._clean = True
 
     def share(self, keyframe: Keyframe, pool: BrickPool) -> VoxelShare:
         """What a keyframe would add."""
@@ -205,8 +206,10 @@ class PixelPass:
         n = len(visible.slots)
         if n * VOXELS * self._words > self._sums.shape[0]:
             runtime.settle()
-            self._sums = ti.ndarray(ti.i64, n * VOXELS * self._words)
-        self._sums.fill(0)
+            self._sums, self._clean = ti.ndarray(ti.i64, n * VOXELS * self._words), False
+        if not self._clean:
+            self._sums.fill(0)
+        self._clean = False
         # Beliefs that have a date are no sums of messages: there the keyframe's own evidence stays in.
         messages = keyframe.messages if pool.dated is None else new_messages(visible, s.limits.precision)
         with s.casting(keyframe, pool.belief, messages, pool.prior_log_odds) as cast:
@@ -234,13 +237,16 @@ def _finish(voxels: I32, visitor: PixelVisitor) -> None:
 
 
 @ti.kernel
-def _add_all(slots: I32Array, given: I64Array, sums: I64Array, words: Template, strip: Template):
+def _take_all(slots: I32Array, given: I64Array, sums: I64Array, words: Template, strip: Template):
     """Add what a keyframe gives (n * 512 * words) in the bricks in ``slots`` (n) to the sums (pool * 512 *
-    words)."""
+    words), and set it to 0."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):
             _add(given, i + k, sums, j + k, words)
+            for word in ti.static(range(words)):
+                if given[words * (i + k) + word] != 0:
+                    given[words * (i + k) + word] = 0
 
 
 @ti.kernel

@@ -46,7 +46,7 @@ class PixelValues(Protocol):
         ...
 
 
-class PixelReader:
+class PixelReader(Protocol):
     """The reading of layers that pixels feed, of a map that has ``pixel_layers``."""
 
     @property
@@ -72,7 +72,7 @@ class PixelReader:
         return np.zeros((len(slots), VOXELS, 4), np.uint8) if layer is None else layer.within(slots)
 
 
-class VoxelMap(Protocol):
+class VoxelMap(PixelReader, Protocol):
     """Bricks of voxels that were measured by a sensor."""
 
     voxel_size: float
@@ -144,24 +144,6 @@ class VoxelMap(Protocol):
         self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
     ) -> NDArray[np.float32]:
         """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, NaN elsewhere."""
-        ...
-
-    @property
-    def pixel_layers(self) -> Mapping[str, PixelValues]:
-        """The layers that pixels feed, by name."""
-        ...
-
-    @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour."""
-        ...
-
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours at (N, 3) points in metres, (N, 4): red, green, blue, and how much was seen; 0 for none."""
-        ...
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
         ...
 
     @property

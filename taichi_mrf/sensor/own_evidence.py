@@ -53,8 +53,10 @@ class OwnEvidence:
         return noise
 
     def arguments(self) -> Mapping[str, Any]:
-        """The arguments of ``add_keyframe`` that state this again."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        """The arguments of ``add_keyframe`` that state this again: images if there are any, since not all
+        methods take them."""
+        stated = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in stated.items() if name != "images" or value}
 
     def content(self) -> bytes:
         """The evidence as bytes to sort by; empty if there is none. Images are none: no marginal depends on

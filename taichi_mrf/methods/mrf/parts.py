@@ -166,7 +166,7 @@ class MapParts:
     def image(
         self, model: NoiseModel, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
         noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
-        pose_covariance: ArrayLike | None, images: Mapping[str, ArrayLike] | None,
+        pose_covariance: ArrayLike | None, images: Mapping[str, ArrayLike] | None = None,
     ) -> DepthImage:  # fmt: skip
         """The arguments of MRFMap.add_keyframe, checked, on the device; ``model`` is the map's noise."""
         sensor = self.config.sensor
