@@ -27,6 +27,14 @@ SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
 
+SERVERS = {
+    "playwright": "playwright.sync_api.sync_playwright",  # its own way to start Chromium
+    "foxglove": "foxglove.start_server",
+    "zenoh": "zenoh.open",
+    "viser": "viser.ViserServer.__init__",
+}
+"""Libraries and their functions that start a process or a server."""
+
 SLOW = (HERE / "doctor", HERE)
 """Folders whose tests take minutes although they are few."""
 
@@ -58,7 +66,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--quick",
         action="store_true",
-        help="leave out tests that start Taichi or a process, or read recordings, but for the smoke tests",
+        help="leave out tests that start Taichi, a process or a server, or read recordings, but for smoke "
+        "tests; take a sixth of the other tests' examples",
     )
 
 
@@ -92,14 +101,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         ]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
+    if config.getoption("--quick") or config.getoption("--arch") == "vulkan":
+        for item in items:
+            _take_fewer_examples(item)
     if config.getoption("--arch") == "cpu":
         return
     used = [item for item in items if _is_for_every_backend(item)]
     config.hook.pytest_deselected(items=[item for item in items if item not in used])
     items[:] = used
-    if config.getoption("--arch") == "vulkan":
-        for item in items:
-            _take_fewer_examples(item)
 
 
 def pytest_make_collect_report(collector: pytest.Collector) -> pytest.CollectReport | None:
@@ -186,25 +195,26 @@ def _is_smoke(item: pytest.Item) -> bool:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """With --quick, skip a test at the point where it, or a fixture, starts Taichi or a process."""
+    """With --quick, skip a test at the point where it, or a fixture, starts Taichi, a process or a server."""
     with pytest.MonkeyPatch.context() as patch:
         if item.config.getoption("--quick"):
             patch.setattr(subprocess.Popen, "__init__", _leave_out)
             patch.setattr(multiprocessing.process.BaseProcess, "start", _leave_out)
-            if importlib.util.find_spec("playwright") is not None:  # its own way to start Chromium
-                patch.setattr("playwright.sync_api.sync_playwright", _leave_out)
+            for library, function in SERVERS.items():
+                if importlib.util.find_spec(library) is not None:
+                    patch.setattr(function, _leave_out)
             if not _is_smoke(item):
                 patch.setattr(runtime, "init", _leave_out)
         yield
 
 
 def _leave_out(*args: Any, **kwargs: Any) -> NoReturn:
-    pytest.skip("left out by --quick: it starts Taichi or a process")
+    pytest.skip("left out by --quick: it starts Taichi, a process or a server")
 
 
 def _take_fewer_examples(item: pytest.Item) -> None:
-    """A software device takes seconds for what a CPU does at once, and a maker of maps needs a dozen kernels
-    for each example: a sixth of the CPU's examples shows whether kernels do the same there."""
+    """A sixth of the examples: of kernels on a software device, which takes seconds for what a CPU does at
+    once, they show whether it does the same, and with --quick whether an edit has broken much."""
     test = getattr(item, "obj", None)
     chosen: settings | None = getattr(test, SETTINGS_OF_A_TEST, None)
     if chosen is not None:

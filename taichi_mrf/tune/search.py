@@ -17,7 +17,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
-from taichi_mrf.viewer.tune.messages import HEADLINE, Objective
+from taichi_mrf.viewer.tune.messages import Objective, headline
 
 SIGMA_SCALE = "sensor.sigma_scale"
 """The factor on every stated sigma. The page has no slider for it: it shows the coefficients themselves."""
@@ -74,9 +74,9 @@ class Search:
         if Optuna is not installed."""
         self.start, self.tries, self.told, self.pixel_stride = start, tries, 0, pixel_stride
         self.best: Config | None = None
-        self.objective, self._best_value = HEADLINE[objective], math.nan
         names = names or [n for n in DEFAULT_SEARCH if n == SIGMA_SCALE or _knob(n).applies(start)]
         self._dimensions = dimensions(names, start)
+        self.objective, self._best_value = headline("voxel_size" not in names)[objective], math.nan
         optuna: Any = library("optuna", "--auto needs", "auto", ConfigError)
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._failed = optuna.trial.TrialState.FAIL

@@ -174,7 +174,8 @@ def judge_unseen(frames: WorkingSet, compared: Sequence[tuple[str, Config]], go_
         if trial is None:
             return None
         scores[name] = trial.scores
-    return Verdict(len(frames.unseen), scores)
+    sizes = {config.voxel_size for _, config in compared}
+    return Verdict(len(frames.unseen), scores, one_size=len(sizes) == 1)
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
@@ -189,5 +190,7 @@ def verdict_lines(verdict: Verdict) -> list[str]:
         values = [kind.value(scores) for scores in verdict.scores.values()]
         if any(map(math.isfinite, values)):
             texts = "  ".join(f"{kind.format(v):>{c}}" for v, c in zip(values, columns, strict=True))
-            lines.append(f"  {kind.label:{width}}  {texts}  {kind.difference(values[-1], values[0])}")
+            alike = verdict.one_size or not kind.in_voxels
+            change = kind.difference(values[-1], values[0]) if alike else "other voxels"
+            lines.append(f"  {kind.label:{width}}  {texts}  {change}")
     return lines

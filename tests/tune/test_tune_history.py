@@ -90,10 +90,26 @@ def test_the_board_tells_how_a_try_differs_from_the_reference() -> None:
     assert "+0.250" in board
     assert "better ▲" in board
     assert "calibration" not in board
-    rest = score_board_html(tries(), 1, 0, headline=False)
+    rest = score_board_html(tries(), 1, 0, first=False)
     assert "calibration, depth ↓" in rest
     assert "calibration, voxels" not in rest  # there is no truth
     assert "no scores yet" in score_board_html([], None, None)
+
+
+def test_voxels_of_another_size_are_compared_in_centimetres() -> None:
+    coarse = dataclasses.replace(FIRST, voxel_size=2 * FIRST.voxel_size)
+    right = dataclasses.replace(SCORES, accuracy_sigma=0.99, accuracy_5cm=SCORES.accuracy_5cm - 0.125)
+    several = [*tries(), Tried(2, coarse, right, "hand")]
+    board = score_board_html(several, shown=2, pinned=0)
+    assert "right, 5 cm" in board
+    assert "worse ▼ -12.5" in board
+    assert "1.5 voxels" not in board
+    rest = score_board_html(several, shown=2, pinned=0, first=False)
+    row = rest.partition("right, 1.5 voxels")[2].partition("</tr>")[0]
+    assert "99.0 %" in row
+    assert "other voxels" in row
+    assert "better" not in row
+    assert "99.0 %" not in table_html(several, 2, 0)
 
 
 def test_a_sparkline_has_a_point_for_each_value_that_there_is() -> None:

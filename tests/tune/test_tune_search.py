@@ -98,6 +98,12 @@ def test_what_cannot_be_searched_is_told_in_one_line() -> None:
         dimensions(("log_odds.hit",), CONFIG)
 
 
+def test_a_search_of_voxel_sizes_aims_at_centimetres() -> None:
+    assert Search(CONFIG, ("inference.sweeps",), 3, 0, objective="right").objective.name == "accuracy_sigma"
+    of_sizes = Search(CONFIG, ("voxel_size", "inference.sweeps"), 3, 0, objective="right")
+    assert of_sizes.objective.name == "accuracy_5cm"
+
+
 def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ConfigError, match=r"--auto needs optuna, .*: pip install 'taichi-mrf\[auto\]'"):
@@ -124,5 +130,11 @@ def test_the_verdict_is_that_of_the_unseen_views() -> None:
     better = dataclasses.replace(
         judged.scores[SHIPPED], log_likelihood=judged.scores[SHIPPED].log_likelihood + 0.25
     )
+    assert judged.one_size
+    coarse = dataclasses.replace(CONFIG, voxel_size=2 * CONFIG.voxel_size)
+    two_sizes = judge_unseen(frames, [(SHIPPED, CONFIG), (FOUND, coarse)], lambda activity, share: True)
+    assert two_sizes is not None
+    of_voxels = [line for line in verdict_lines(two_sizes) if line.strip().startswith("right, 1.5 voxels")]
+    assert of_voxels[0].endswith("other voxels")
     lines = verdict_lines(Verdict(1, judged.scores | {FOUND: better}))
     assert any(line.strip().startswith("fit, log-likelihood") and line.endswith("+0.250") for line in lines)

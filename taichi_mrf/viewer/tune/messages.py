@@ -69,7 +69,8 @@ class Scores:
 
 @dataclass(frozen=True)
 class ScoreKind:
-    """How one score is shown: multiplied by ``factor``, formatted with ``form``, with a unit."""
+    """How one score is shown: multiplied by ``factor``, formatted with ``form``, with a unit. One
+    ``in_voxels`` only compares maps whose voxels have the same size."""
 
     name: str
     label: str
@@ -77,6 +78,7 @@ class ScoreKind:
     factor: float = 1.0
     form: str = ".3f"
     unit: str = ""
+    in_voxels: bool = False
 
     def text(self, scores: Scores) -> str:
         """The score as text."""
@@ -98,15 +100,15 @@ class ScoreKind:
 
 
 KINDS = (
-    ScoreKind("accuracy_voxel", "right, in the voxel", "higher", 100, ".1f", "%"),
-    ScoreKind("accuracy_sigma", "right, 1.5 voxels", "higher", 100, ".1f", "%"),
+    ScoreKind("accuracy_voxel", "right, in the voxel", "higher", 100, ".1f", "%", True),
+    ScoreKind("accuracy_sigma", "right, 1.5 voxels", "higher", 100, ".1f", "%", True),
     ScoreKind("accuracy_5cm", "right, 5 cm", "higher", 100, ".1f", "%"),
     ScoreKind("unanswered", "no surface", "lower", 100, ".1f", "%"),
     ScoreKind("median_abs_m", "median depth error", "lower", 1000, ".1f", "mm"),
     ScoreKind("rms_m", "RMS depth error", "lower", 1000, ".0f", "mm"),
     ScoreKind("log_likelihood", "fit, log-likelihood", "higher", 1, "+.3f"),
     ScoreKind("depth_calibration", "calibration, depth", "lower", 100, ".1f", "%"),
-    ScoreKind("voxel_calibration", "calibration, voxels", "lower", 100, ".2f", "%"),
+    ScoreKind("voxel_calibration", "calibration, voxels", "lower", 100, ".2f", "%", True),
     ScoreKind("seconds", "time to map", "lower", 1, ".2f", "s"),
     ScoreKind("voxels", "voxels", "neither", 1, ",.0f"),
     ScoreKind("keyframes", "keyframes", "neither", 1, ".0f"),
@@ -114,12 +116,16 @@ KINDS = (
 """In the order of the page."""
 
 _BY_NAME = {kind.name: kind for kind in KINDS}
-HEADLINE: dict[Objective, ScoreKind] = {
-    "right": _BY_NAME["accuracy_sigma"],
-    "depth-error": _BY_NAME["median_abs_m"],
-    "fit": _BY_NAME["log_likelihood"],
-}
-"""The scores that the page shows first, of which each can be the aim of a search."""
+
+
+def headline(one_size: bool) -> dict[Objective, ScoreKind]:
+    """The scores that the page shows first, of which each can be the aim of a search; unless all maps have
+    voxels of one size, pixels are right within centimetres."""
+    return {
+        "right": _BY_NAME["accuracy_sigma" if one_size else "accuracy_5cm"],
+        "depth-error": _BY_NAME["median_abs_m"],
+        "fit": _BY_NAME["log_likelihood"],
+    }
 
 
 def scores_in_words(scores: Scores) -> list[str]:
@@ -238,10 +244,11 @@ class HeldOutView(Update):
 @dataclass(frozen=True)
 class Verdict(Update):
     """Gain of a search: the scores, on ``views`` that were kept from it, of some parameters by name;
-    the last are those that it has found."""
+    the last are those that it has found. ``one_size``: their maps have voxels of the same size."""
 
     views: int
     scores: dict[str, Scores]
+    one_size: bool = True
 
 
 @dataclass(frozen=True)
@@ -287,8 +294,8 @@ class StartSearch(Request):
     """Search from the parameters in force, with an empty table of tries."""
 
     objective: Objective = "fit"
-    """Aim: most pixels right within 1.5 voxels, smallest median depth error, or best fit. The fit counts
-    how far the map's probabilities can be trusted, too."""
+    """Aim: most pixels right within 1.5 voxels (5 cm if voxel sizes are searched), smallest median depth
+    error, or best fit. The fit counts how far the map's probabilities can be trusted, too."""
 
     tries: Annotated[int, Range(5, 200, 1)] = 30
     """Number of maps that the search makes."""

@@ -22,7 +22,7 @@ from taichi_mrf.viewer.scene.viewpoint import Side
 from taichi_mrf.viewer.scene.widgets import OptionWidgets, add_widget, change, in_html, in_markdown
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
-from taichi_mrf.viewer.tune.plots import NoisePlot, score_board_html, verdict_html
+from taichi_mrf.viewer.tune.plots import NoisePlot, one_size, score_board_html, verdict_html
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class TunePanel(BasePanel):
     def show_tries(self, tries: Sequence[t.Tried], shown: int | None, pinned: int | None) -> None:
         """The scores, and the table. The dropdown goes to a try that is newly shown, else it stays."""
         self._scores.content = score_board_html(tries, shown, pinned)
-        self._more_scores.content = score_board_html(tries, shown, pinned, headline=False)
+        self._more_scores.content = score_board_html(tries, shown, pinned, first=False)
         self._table.content = table_html(tries, shown, pinned)
         if not tries:
             self._names = {}
@@ -279,7 +279,8 @@ def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) 
         key=lambda each: each.scores.log_likelihood,
         default=None,
     )
-    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in t.HEADLINE)
+    kinds = t.headline(one_size(tries))
+    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in kinds)
     rows = [f'<tr style="opacity:0.65"><th></th>{head}</tr>']
     for each in list(tries)[: -MOST_TRIES - 1 : -1]:
         marks = "▸" if each.number == shown else ""
@@ -288,14 +289,14 @@ def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) 
         about = "~" if each.scores.pixel_stride > 1 else ""
         numbers = "".join(
             f'<td style="text-align:right;white-space:nowrap">{about}{kind.text(each.scores)}</td>'
-            for kind in t.HEADLINE.values()
+            for kind in kinds.values()
         )
         shade = "background:rgba(0,114,178,0.12);" if each.number == shown else ""
         rows.append(
             f'<tr style="{shade}"><td style="white-space:nowrap"><b>{each.number}</b> {marks}'
             f"{'◆' * (each.by == 'search')}</td>{numbers}</tr>"
             f'<tr style="{shade}"><td></td>'
-            f'<td colspan="{len(t.HEADLINE)}" style="opacity:0.7;padding-bottom:3px">'
+            f'<td colspan="{len(kinds)}" style="opacity:0.7;padding-bottom:3px">'
             f"{in_html(changes(tries[0].config, each.config))}</td></tr>"
         )
     key = "▸ shown · A reference · ★ best fit · ◆ from the search · ~ some of the pixels"

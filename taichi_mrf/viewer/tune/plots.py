@@ -18,7 +18,7 @@ from taichi_mrf.config.text import field_help
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
 from taichi_mrf.viewer.scene.widgets import in_html, in_markdown
-from taichi_mrf.viewer.tune.messages import HEADLINE, KINDS, Residuals, ScoreKind, Scores, Tried, Verdict
+from taichi_mrf.viewer.tune.messages import KINDS, Residuals, ScoreKind, Scores, Tried, Verdict, headline
 
 MOST_POINTS = 60
 """Of the latest tries, how many a sparkline shows."""
@@ -31,8 +31,13 @@ _SAME = 0.005
 """Differences below this share of the range over all tries get no colour."""
 
 
+def one_size(tries: Sequence[Tried]) -> bool:
+    """True if the voxels of all tries' maps have the same size."""
+    return len({each.config.voxel_size for each in tries}) < 2
+
+
 def score_board_html(
-    tries: Sequence[Tried], shown: int | None, pinned: int | None, headline: bool = True
+    tries: Sequence[Tried], shown: int | None, pinned: int | None, first: bool = True
 ) -> str:
     """A table with a row for each of the first scores, or for each other score that any try has. ``shown``
     and ``pinned`` are numbers of tries."""
@@ -40,10 +45,11 @@ def score_board_html(
     here, reference = by_number.get(-1 if shown is None else shown), by_number.get(pinned or 0)
     if here is None:
         return _table('<tr><td style="opacity:0.6">no scores yet</td></tr>')
+    firsts = tuple(headline(one_size(tries)).values())
     rows = [
         _row(kind, tries, here, reference)
-        for kind in (HEADLINE.values() if headline else KINDS)
-        if headline or kind not in HEADLINE.values()
+        for kind in (firsts if first else KINDS)
+        if first or kind not in firsts
         if any(math.isfinite(kind.value(each.scores)) for each in tries)
     ]
     coarse = (
@@ -54,7 +60,7 @@ def score_board_html(
         f'<tr><td colspan="4"><b>Try {here.number}</b>'
         f'<span style="opacity:0.65">{in_html(coarse + against)}</span></td></tr>'
     )
-    return _table(head * headline + "".join(rows))
+    return _table(head * first + "".join(rows))
 
 
 def verdict_html(verdict: Verdict) -> str:
@@ -62,7 +68,7 @@ def verdict_html(verdict: Verdict) -> str:
     first, *_, last = verdict.scores.values()
     names = "".join(f'<th style="font-weight:500">{in_html(name)}</th>' for name in verdict.scores)
     rows = [f'<tr style="opacity:0.65;text-align:right"><th></th>{names}<th></th></tr>']
-    for kind in HEADLINE.values():
+    for kind in headline(verdict.one_size).values():
         values = "".join(_cell(kind.text(scores)) for scores in verdict.scores.values())
         rows.append(f"<tr>{_label(kind)}{values}{_change(kind, last, first)}</tr>")
     return _table("".join(rows))
@@ -101,12 +107,18 @@ def sparkline_svg(values: Sequence[float], shown: int, reference: float) -> str:
 
 def _row(kind: ScoreKind, tries: Sequence[Tried], here: Tried, reference: Tried | None) -> str:
     latest = list(tries)[-MOST_POINTS:]
-    values = [kind.value(each.scores) for each in latest]
-    against = float("nan") if reference is None else kind.value(reference.scores)
+
+    def comparable(other: Tried) -> bool:
+        return not kind.in_voxels or other.config.voxel_size == here.config.voxel_size
+
+    values = [kind.value(each.scores) if comparable(each) else float("nan") for each in latest]
+    unlike = reference is not None and not comparable(reference)
+    against = float("nan") if reference is None or unlike else kind.value(reference.scores)
     shown = next((i for i, each in enumerate(latest) if each is here), -1)
     known = [value for value in values if math.isfinite(value)]
     other = None if reference is None or reference is here else reference.scores
     change = _change(kind, here.scores, other, max(known, default=0.0) - min(known, default=0.0))
+    change = _cell("other voxels") if unlike else change
     text = f"<b>{kind.text(here.scores)}</b>"
     return f"<tr>{_label(kind)}{_cell(text)}{change}<td>{sparkline_svg(values, shown, against)}</td></tr>"
 
