@@ -43,6 +43,7 @@ from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path, write_npz
 from taichi_mrf.system.libraries import library
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 _DEFAULTS = ExportOptions()
@@ -292,7 +293,10 @@ def _chunks(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     kept = options.surface == "rays" or (options.surface == "auto" and m.config.keep_surface)
     measured = _with_rays(m, path, options) if kept else None
     up = _up(m, options) if options.up != "auto" else None
-    write_chunks(path, m, up, _photo(m, path, options), measured)
+    fed = {name: layer for name, layer in m.pixel_layers.items() if layer}
+    if _photo(m, path, options) is None:
+        fed.pop(COLORS, None)
+    write_chunks(path, m, up, fed, measured)
     return [path]
 
 

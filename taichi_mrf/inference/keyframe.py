@@ -1,5 +1,6 @@
 """A keyframe: a depth image, its pose, the bricks that its rays cross, and its messages to their voxels."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.layers import pixel_layers
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
@@ -49,17 +51,21 @@ def checked_depth(depth_m: ArrayLike, camera: Camera, min_depth: float) -> NDArr
     return kept
 
 
-def checked_color(color: ArrayLike | None, camera: Camera) -> NDArray[np.uint8] | None:
-    """A copy of an (H, W, 3) RGB image, None for None. Raises KeyframeError if it does not have the camera's
-    shape, or is no uint8."""
-    if color is None:
-        return None
-    image = np.asarray(color)
-    if image.shape != (*camera.shape, 3) or image.dtype != np.uint8:
-        raise KeyframeError(
-            f"a colour image must be uint8 of the shape {(*camera.shape, 3)}, not {image.dtype} {image.shape}"
-        )
-    return image.copy()
+def checked_images(images: Mapping[str, ArrayLike | None], camera: Camera) -> dict[str, NDArray[np.uint8]]:
+    """Copies of images beside depth by name, but for those that are None. Raises KeyframeError for one that
+    no layer follows from (voxels/layers.py), of another shape than the camera's, or no uint8."""
+    channels, found = {made.image: made.channels for made in pixel_layers().values()}, {}
+    for name, given in images.items():
+        if name not in channels:
+            raise KeyframeError(f"no layer follows from an image {name!r}: there are {', '.join(channels)}")
+        if given is not None:
+            image, shape = np.asarray(given), (*camera.shape, *([channels[name]] * (channels[name] > 1)))
+            if image.shape != shape or image.dtype != np.uint8:
+                raise KeyframeError(
+                    f"the image {name} must be uint8 of the shape {shape}, not {image.dtype} {image.shape}"
+                )
+            found[name] = image.copy()
+    return found
 
 
 TILE = 32
@@ -319,6 +325,10 @@ class Keyframe:
     def own(self) -> OwnEvidence:
         """Evidence that it states of its own measurements."""
         return self.image.own
+
+    def beside(self, image: str) -> NDArray[np.uint8] | None:
+        """The image beside depth that a layer follows from (layers.FromPixels), None without one."""
+        return self.color if image == "color" else self.own.images.get(image)
 
     @property
     def image_bytes(self) -> int:

@@ -12,7 +12,7 @@ made.
 In front of all their surfaces the rays of a group have one shared path, as for messages (ray_list.py).
 
 What is done with a ray's posterior is up to a :class:`RayVisitor`. There are three: the surface counts rays
-by the chance that they met one (surface_rays.py), colours go to the voxels that pixels saw (voxel_colors.py),
+by the chance that they met one (surface_rays.py), pixels feed the voxels that they saw (pixel_pass.py),
 and rays vote for their likeliest voxel (surface_votes.py).
 """
 

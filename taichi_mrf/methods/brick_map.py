@@ -23,10 +23,10 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.queries.points import checked_points, classify, point_log_odds, probability
+from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.survey import Occlusion
 from taichi_mrf.queries.view import Answer, RayProfile, View
-from taichi_mrf.queries.voxel_map import VoxelMap
+from taichi_mrf.queries.voxel_map import PixelReader, VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
@@ -35,7 +35,6 @@ from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.later import later
 from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.distance_field import DistanceSource
-from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology, create_topology, recycle
 
@@ -86,7 +85,7 @@ def check_inference(
     return list(dict.fromkeys(iterable(keyframes, "keyframes", "a list of keyframe ids")))
 
 
-class BrickMap(Owned):
+class BrickMap(PixelReader, Owned):
     """An empty map of bricks that answers queries; a method's map subclasses it and says how to fill it.
 
     ``config`` is the whole configuration that the map was made with, ``view`` follows rays through the map.
@@ -245,19 +244,6 @@ class BrickMap(Owned):
     def _measured_surface(self) -> "MeasuredDepth | None":
         """The surface that keyframes measured, as rays meet it; None in maps without one."""
         return None
-
-    @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour."""
-        return False
-
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours at (N, 3) points in metres, (N, 4): red, green, blue, and how much was seen; 0 for none."""
-        return np.zeros((len(checked_points(points)), 4), np.uint8)
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
-        return np.zeros((len(slots), VOXELS, 4), np.uint8)
 
     @property
     def has_surface(self) -> bool:

@@ -33,7 +33,7 @@ class BrickRegistry:
         self.frozen_crossed: Bricks = np.zeros((0, 3), np.int32)
         self._frozen_keys = np.zeros(0, np.int64)
         self.before_claim: Callable[[Bricks], None] | None = None  # with the bricks (n, 3) to be crossed
-        self.on_release: Callable[[Bricks], None] | None = None  # with the bricks (n, 3) that are gone
+        self.on_release: list[Callable[[Bricks], None]] = []  # with the bricks (n, 3) that are gone
 
     def claim(self, footprint: Footprint) -> None:
         """Allocate a keyframe's surface bricks and count its ownership and its crossings.
@@ -152,8 +152,8 @@ class BrickRegistry:
         self.topology.erase(bricks)
         self.pool.release(slots)
         self._note_change(bricks)
-        if self.on_release is not None:
-            self.on_release(bricks)
+        for forget in self.on_release:
+            forget(bricks)
 
     def _note_change(self, bricks: Bricks) -> None:
         self.version += 1

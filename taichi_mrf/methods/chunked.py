@@ -1,7 +1,7 @@
 """A finished map that is read from disk by chunks of 64^3 voxels and never held in memory as a whole."""
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Literal
@@ -21,12 +21,22 @@ from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.methods.mrf.calibrated import calibrate, carry
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
+from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE
 from taichi_mrf.queries.points import checked_points, classify, probability
+from taichi_mrf.queries.voxel_map import PixelReader
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.calls import WON, follow_calls
-from taichi_mrf.voxels.layers import COLORS, FIRST, LOG_ODDS, SURFACE, Chunk
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, join_bricks, split_bricks
+from taichi_mrf.voxels.layers import FIRST, LAYERS, LOG_ODDS, SURFACE, Chunk, pixel_layers
+from taichi_mrf.voxels.layout import (
+    BRICK,
+    CHUNK,
+    CHUNK_VOXELS,
+    VOXELS,
+    join_bricks,
+    offsets_in_brick,
+    split_bricks,
+)
 
 _BYTES_PER_VOXEL = 9
 """Log-odds, states, and temporary arrays."""
@@ -66,7 +76,7 @@ is occupied from; the marginals' alone; those of what is occupied; or those that
 probabilities."""
 
 
-class ChunkedMap:
+class ChunkedMap(PixelReader):
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
@@ -83,7 +93,7 @@ class ChunkedMap:
         self._most = int(cache_mb * 1e6) // CHUNK_BYTES
         self._known = set(map(tuple, self.chunks.tolist()))
         self._cache: OrderedDict[Chunk, NDArray[np.float32]] = OrderedDict()
-        self._colors = lru_cache(self._most)(lambda chunk: store.read(COLORS, chunk))
+        self.read_layer = lru_cache(self._most)(store.read)
 
     @classmethod
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
@@ -125,9 +135,9 @@ class ChunkedMap:
         return up_from_name(self.header.up) if self.header.up else None
 
     @property
-    def has_colors(self) -> bool:
-        """True if the store holds the colours that cameras saw."""
-        return COLORS in self.store.layers
+    def pixel_layers(self) -> "Mapping[str, StoredLayer]":
+        """The layers that pixels feed and that the store holds."""
+        return {name: StoredLayer(self, name) for name in pixel_layers() if name in self.store.layers}
 
     @property
     def has_surface(self) -> bool:
@@ -158,19 +168,9 @@ class ChunkedMap:
             return self.decided.log_odds(points)
         voxels = _voxels_of(points, self.voxel_size)
         out = np.full(len(voxels), self.header.prior_log_odds, np.float32)
-        for chunk, rows in self._by_chunk(voxels):
+        for chunk, rows in self.by_chunk(voxels):
             found = self._block(chunk)[tuple((voxels[rows] % CHUNK_VOXELS).T)]
             out[rows] = np.where(np.isnan(found), self.header.prior_log_odds, found)
-        return out
-
-    @tensors.in_kind("points")
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours of the voxels that hold points (N, 3) in metres, (N, 4) uint8: red, green, blue, and how
-        much was seen; 0 for none. Raises ConfigError for points of another shape or that are not finite."""
-        voxels = _voxels_of(points, self.voxel_size)
-        out = np.zeros((len(voxels), 4), np.uint8)
-        for chunk, rows in self._by_chunk(voxels) if self.has_colors else ():
-            out[rows] = self._colors(chunk)[tuple((voxels[rows] % CHUNK_VOXELS).T)]
         return out
 
     @tensors.in_kind("points")
@@ -242,7 +242,7 @@ class ChunkedMap:
     def _state(self, log_odds: NDArray[np.float32]) -> NDArray[np.int8]:
         return classify(log_odds, self.header.prior_log_odds, self.header.min_evidence)
 
-    def _by_chunk(self, voxels: NDArray[np.int64]) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
+    def by_chunk(self, voxels: NDArray[np.int64]) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
         """The known chunks that hold some of the voxels (n, 3), each with the rows of these."""
         chunks, owner = np.unique(voxels // CHUNK_VOXELS, axis=0, return_inverse=True)
         for number, (x, y, z) in enumerate(chunks.tolist()):
@@ -304,3 +304,38 @@ class ChunkedMap:
         bricks = (places[near] + first).astype(np.int32)
         calibrate(field, bricks, near, log_odds.reshape(-1), self.header.prior_log_odds)
         return join_bricks(log_odds, block.shape)
+
+
+class StoredLayer:
+    """A layer of a store that pixels feed. ``bricks`` (slots, 3) are those of a part of the map."""
+
+    def __init__(self, source: ChunkedMap, name: str, bricks: NDArray[np.int32] | None = None) -> None:
+        self._source, self._name, self._bricks = source, name, bricks
+
+    def __bool__(self) -> bool:
+        """Always True: a store has the layers that it was made with."""
+        return True
+
+    def at(self, points: ArrayLike) -> NDArray:
+        """Values (N, ...) of the voxels that hold points (N, 3) in metres; 0 for none. Raises ConfigError for
+        points of another shape or that are not finite."""
+        voxels, layer = _voxels_of(points, self._source.voxel_size), LAYERS[self._name]
+        out = np.zeros((len(voxels), *layer.shape), layer.dtype)
+        for chunk, rows in self._source.by_chunk(voxels):
+            block = self._source.read_layer(self._name, chunk)
+            out[rows] = block[tuple((voxels[rows] % CHUNK_VOXELS).T)]
+        return out
+
+    def within(self, slots: NDArray[np.int32]) -> NDArray:
+        """Values of the voxels of some bricks of a part, (n,) slots -> (n, 512, ...); 0 where a slot is
+        -1."""
+        assert self._bricks is not None
+        layer = LAYERS[self._name]
+        out = np.zeros((len(slots), VOXELS, *layer.shape), layer.dtype)
+        here = np.flatnonzero(slots >= 0)
+        for begin in range(0, len(here), BRICKS_AT_ONCE):
+            rows = here[begin : begin + BRICKS_AT_ONCE]
+            voxels = self._bricks[slots[rows]].astype(np.float64)[:, None] * BRICK + offsets_in_brick() + 0.5
+            found = self.at(voxels.reshape(-1, 3) * self._source.voxel_size)
+            out[rows] = found.reshape(-1, *out.shape[1:])
+        return out

@@ -13,9 +13,8 @@ from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, within_voxels, without_free
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.methods.capabilities import window_of
-from taichi_mrf.methods.chunked import SAME_LOG_ODDS, ChunkedMap
+from taichi_mrf.methods.chunked import SAME_LOG_ODDS, ChunkedMap, StoredLayer
 from taichi_mrf.methods.map_file import MapHeader
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -25,17 +24,17 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.colored import blended_colors
-from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader
+from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import Answer, View
-from taichi_mrf.queries.voxel_map import Placed
+from taichi_mrf.queries.voxel_map import PixelReader, PixelValues, Placed
 from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import owned_attribute
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys, split_bricks
+from taichi_mrf.voxels.layout import BRICK, CHUNK, grid_keys, split_bricks
 from taichi_mrf.voxels.pool import BrickPool
 
 _MARGIN = BRICK
@@ -44,7 +43,7 @@ normal and standard deviation depend on."""
 
 
 @dataclass
-class MapPart:
+class MapPart(PixelReader):
     """The bricks of a chunked map from ``lowest`` to ``after`` (exclusive), (3,) each; everything outside is
     unknown. ``free_bricks`` (n, 3) were seen to be free and have no voxels. It has the queries of a map, but
     no keyframes and no inference."""
@@ -140,28 +139,11 @@ class MapPart:
         return self.source.voxels(self.lowest * brick_m, self.after * brick_m, min_probability)
 
     @property
-    def has_colors(self) -> bool:
-        """True if the map holds the colours that cameras saw."""
-        return self.source.has_colors
-
-    @tensors.in_kind("points")
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours of the voxels that hold points (N, 3) in metres, (N, 4), as of ChunkedMap, outside of the
-        box too: the colours of a mesh at its border are blended with those beyond."""
-        return self.source.colors(points)
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4); none where a slot
-        is -1."""
-        out = np.zeros((len(slots), VOXELS, 4), np.uint8)
-        here = np.flatnonzero(slots >= 0)
-        voxels = np.indices((BRICK,) * 3).reshape(3, -1).T + 0.5
-        for begin in range(0, len(here), BRICKS_AT_ONCE):
-            rows = here[begin : begin + BRICKS_AT_ONCE]
-            corners = self.view.pool.bricks[slots[rows]].astype(np.float64) * BRICK
-            points_m = (corners[:, None] + voxels).reshape(-1, 3) * self.voxel_size
-            out[rows] = self.source.colors(points_m).reshape(-1, VOXELS, 4)
-        return out
+    def pixel_layers(self) -> Mapping[str, PixelValues]:
+        """The layers that pixels feed, as of ChunkedMap, outside of the box too: the colours of a mesh at its
+        border are blended with those beyond."""
+        bricks, names = self.view.pool.bricks, self.source.pixel_layers
+        return {name: StoredLayer(self.source, name, bricks) for name in names}
 
     @property
     def has_surface(self) -> bool:
@@ -303,8 +285,8 @@ def in_memory(m: ChunkedMap, memory_limit_gb: float | None = None) -> MRFMap:
         frozen_crossed=np.concatenate([bricks, part.free_bricks]),
         frozen={0: m.store.path.name},
         parked=[],
-        colors=np.zeros((0, VOXELS, 4), np.uint8),
-        frozen_colors=ColorShare.nothing(),
+        layers={},
+        shares={},
         kept=RayShare.nothing(),
     )
     return MRFMap.holding(contents, m.store.path, memory_limit_gb)

@@ -30,6 +30,7 @@ from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.sensor.stored import is_stored, read_stored, stored_arrays
 from taichi_mrf.system.later import later
 from taichi_mrf.system.npz_file import NpzFile, open_npz
+from taichi_mrf.voxels.layers import pixel_layers
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.topology import SparseTopology
 
@@ -287,7 +288,7 @@ def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
         arrays[f"{prefix}no_return"] = own.no_return
     if own.pose_covariance is not None:
         arrays[f"{prefix}pose_covariance"] = own.pose_covariance
-    return arrays
+    return arrays | {f"{prefix}image_{name}": image for name, image in own.images.items()}
 
 
 def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
@@ -303,7 +304,12 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
     if f"{prefix}pose_covariance" in file:
         with file.values_of(f"{prefix}pose_covariance"):
             covariance = checked_covariance(file.array(f"{prefix}pose_covariance", "f", (6, 6)))
-    return OwnEvidence(noise, sigma_m, no_return, covariance)
+    images = {}
+    for made in pixel_layers().values():
+        if (stored := f"{prefix}image_{made.image}") in file:
+            shape = (*camera.shape, *([made.channels] * (made.channels > 1)))
+            images[made.image] = file.array(stored, "u", shape).astype(np.uint8)
+    return OwnEvidence(noise, sigma_m, no_return, covariance, images)
 
 
 def camera_arrays(cameras: Sequence[Camera]) -> dict[str, NDArray]:

@@ -156,6 +156,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         sigma_m: ArrayLike | None = None,
         no_return: ArrayLike | None = None,
         pose_covariance: ArrayLike | None = None,
+        images: Mapping[str, ArrayLike] | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does. With a
         half-life a scan that is older than another one makes the map stale.
@@ -165,10 +166,13 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         keyframes added before; ``noise``, ``sigma_m`` and ``pose_covariance`` are those of
         MRFMap.add_keyframe, and ``no_return`` is checked, and used only by a log-odds map with
         ``sensor.no_return: free``. Returns the keyframe's id. Raises KeyframeError for a wrong shape or pose,
-        CapacityError if the map would not fit, ConfigError for a ``color`` image: the map has no colours.
+        CapacityError if the map would not fit, ConfigError for a ``color`` image or ``images``: the map has
+        no layers of these.
         """
-        if color is not None:
-            raise ConfigError(f"a map of the method {self.METHOD.name} has no colours: pass no color")
+        if color is not None or images:
+            raise ConfigError(
+                f"a map of the method {self.METHOD.name} has no colours: pass no color or images"
+            )
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)

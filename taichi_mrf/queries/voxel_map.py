@@ -13,10 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
+from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import Answer, View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.system import tensors
 from taichi_mrf.voxels.distance_field import DistanceSource
+from taichi_mrf.voxels.layers import COLORS
+from taichi_mrf.voxels.layout import VOXELS
 
 
 class Placed(Protocol):
@@ -26,7 +30,49 @@ class Placed(Protocol):
     def T_world_camera(self) -> Pose: ...
 
 
-class VoxelMap(Protocol):
+class PixelValues(Protocol):
+    """A layer of voxels that pixels feed (voxels/layers.py)."""
+
+    def __bool__(self) -> bool:
+        """True if any voxel may have a value."""
+        ...
+
+    def at(self, points: ArrayLike) -> NDArray[Any]:
+        """Values (N, ...) of the voxels that hold points (N, 3) in metres."""
+        ...
+
+    def within(self, slots: NDArray[np.int32]) -> NDArray[Any]:
+        """Values of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, ...)."""
+        ...
+
+
+class PixelReader(Protocol):
+    """The reading of layers that pixels feed, of a map that has ``pixel_layers``."""
+
+    @property
+    def pixel_layers(self) -> Mapping[str, PixelValues]:
+        """The layers of voxels that pixels feed, by name (voxels/layers.py)."""
+        return {}
+
+    @property
+    def has_colors(self) -> bool:
+        """True if any voxel may have a colour: a keyframe has been added with a colour image."""
+        return bool(self.pixel_layers.get(COLORS))
+
+    @tensors.in_kind("points")
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how much of
+        the voxel was seen, 0 for nothing."""
+        layer = self.pixel_layers.get(COLORS)
+        return np.zeros((len(checked_points(points)), 4), np.uint8) if layer is None else layer.at(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
+        layer = self.pixel_layers.get(COLORS)
+        return np.zeros((len(slots), VOXELS, 4), np.uint8) if layer is None else layer.within(slots)
+
+
+class VoxelMap(PixelReader, Protocol):
     """Bricks of voxels that were measured by a sensor."""
 
     voxel_size: float
@@ -98,19 +144,6 @@ class VoxelMap(Protocol):
         self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
     ) -> NDArray[np.float32]:
         """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, NaN elsewhere."""
-        ...
-
-    @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour."""
-        ...
-
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours at (N, 3) points in metres, (N, 4): red, green, blue, and how much was seen; 0 for none."""
-        ...
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
         ...
 
     @property

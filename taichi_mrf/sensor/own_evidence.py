@@ -1,7 +1,7 @@
 """Evidence that one keyframe states of its own measurements, in place of what its map assumes of all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -33,13 +33,15 @@ class OwnEvidence:
 
     ``sigma_m`` is (H, W) float32, the standard deviation of each pixel's depth in metres; 0 stands for that
     of the noise model. ``no_return`` is a :data:`NoReturn`. ``pose_covariance`` is (6, 6), of a twist in the
-    camera's frame (pose_doubt.py).
+    camera's frame (pose_doubt.py). ``images`` are those beside depth that layers of voxels follow from, but
+    for colour, by name (voxels/layers.py): (H, W), or (H, W, channels).
     """
 
     noise: NoiseModel | None = None
     sigma_m: NDArray[np.float32] | None = None
     no_return: NoReturn | None = None
     pose_covariance: Covariance | None = None
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
     def noise_model(self, default: NoiseModel, depth_m: NDArray[np.floating]) -> NoiseModel:
         """The noise of a depth image (H, W) whose map has the noise ``default``."""
@@ -51,11 +53,14 @@ class OwnEvidence:
         return noise
 
     def arguments(self) -> Mapping[str, Any]:
-        """The arguments of ``add_keyframe`` that state this again."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """The arguments of ``add_keyframe`` that state this again: images if there are any, since not all
+        methods take them."""
+        stated = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in stated.items() if name != "images" or value}
 
     def content(self) -> bytes:
-        """The evidence as bytes to sort by; empty if there is none."""
+        """The evidence as bytes to sort by; empty if there is none. Images are none: no marginal depends on
+        them."""
         noise = self.noise
         parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
         arrays = (self.sigma_m, self.no_return, self.pose_covariance)
@@ -66,7 +71,8 @@ class OwnEvidence:
     def nbytes(self) -> int:
         """Bytes of its images in host memory, and of a sigma of its own that kernels read."""
         sigma = 0 if self.sigma_m is None else 2 * self.sigma_m.nbytes
-        return sigma + (0 if self.no_return is None else self.no_return.nbytes)
+        images = sum(image.nbytes for image in self.images.values())
+        return sigma + images + (0 if self.no_return is None else self.no_return.nbytes)
 
 
 NOTHING = OwnEvidence()

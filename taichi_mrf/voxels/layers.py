@@ -1,12 +1,19 @@
-"""The layers of a map: named values of each voxel, and the one table that says what they are.
+"""The layers of a map: named values of each voxel, and the one table that says what they are, and how pixels
+make them.
 
-Maps in chunks, windows and submaps hold the layers that a map has, and loop over the table to write, move and
-read them. A new layer is an entry here, and a value where its source is read (export/chunk_blocks.py for maps
+A layer that pixels feed (colours; ``from_pixels``) is an entry here and the visitor that it names: what a
+ray's posterior adds to a voxel's sums (inference/pixel_pass.py). Adding and removing keyframes, freezing,
+saving, loading, windows, chunks, readings of other times and exports in chunks loop over the table, and so
+does the check of the images beside depth (``add_keyframe(images=...)``).
+
+A layer of another source is an entry, and a value where the source is read (export/chunk_blocks.py for maps
 in memory).
 """
 
+import importlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +25,37 @@ Chunk = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
+class FromPixels:
+    """How a layer follows from an image beside depth.
+
+    ``image`` is the argument of ``add_keyframe``, or the name among its ``images``; ``channels`` uint8 of a
+    pixel, all 0 where it says nothing. ``visitor`` is the module and the class of its PixelVisitor, loaded
+    when a map is first asked for the layer. A voxel's sums are int64 ``words``, each of which holds two
+    numbers; ``stored`` and the words' names are those of what frozen keyframes gave, in files.
+    """
+
+    image: str
+    channels: int
+    visitor: str
+    stored: str
+    words: tuple[str, ...]
+
+    def load_visitor(self) -> Any:
+        """The visitor's class, imported now."""
+        module, _, name = self.visitor.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+
+@dataclass(frozen=True)
 class Layer:
-    """The ``dtype`` of a voxel's values, how many there are (``width``), and the value that is ``missing``
-    where nothing is known."""
+    """The ``dtype`` of a voxel's values, how many there are (``width``), the value that is ``missing``
+    where nothing is known, and how pixels make it, if they do."""
 
     dtype: str
     width: int
     missing: float
     about: str
+    from_pixels: FromPixels | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -40,13 +70,22 @@ class Layer:
 
 LOG_ODDS, COLORS, SURFACE, FIRST = "log_odds", "colors", "surface", "first_surface"
 
+_OF_COLOR_IMAGES = FromPixels(
+    "color", 3, "taichi_mrf.inference.voxel_colors:ColorVisitor", "frozen_color", ("rg", "bw")
+)
+
 LAYERS = {
     LOG_ODDS: Layer("float32", 1, np.nan, "log-odds of being occupied"),
-    COLORS: Layer("uint8", 4, 0, "red, green, blue, and how much was seen"),
+    COLORS: Layer("uint8", 4, 0, "red, green, blue, and how much was seen", _OF_COLOR_IMAGES),
     SURFACE: Layer("float32", 3, 0, "weight, and distance and excess times weight (DistanceField)"),
     FIRST: Layer("uint8", 1, 0, "what rays say beyond the marginal (calls.py)"),
 }
 """Every map has log-odds; the others are there if it has them."""
+
+
+def pixel_layers() -> dict[str, FromPixels]:
+    """The layers that pixels feed."""
+    return {name: layer.from_pixels for name, layer in LAYERS.items() if layer.from_pixels is not None}
 
 
 @dataclass(frozen=True)

@@ -8,50 +8,25 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from one_pixel import VOXEL, FineMap, look_along
+from one_pixel import VOXEL, FineMap, cavities, look_along, spread
 from oracles import inference as reference
 from oracles.forward import Noise
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.inference.color_sums import ColorShare
-from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.voxel_share import VoxelShare
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.colors import NO_COLOR
-from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
+from taichi_mrf.voxels.layout import VOXELS
 
 # Written out, and not imported: these tests hold the value.
 WEIGHT_STEPS = 255 / 32
 
 pytestmark = pytest.mark.usefixtures("backend")
-
-
-def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:
-    """Log-odds of the voxels that a keyframe sees, without its own messages."""
-    bricks = k.footprint.window.bricks_of(k.visible.cells)
-    voxels = (bricks[:, None] * BRICK + offsets_in_brick()).reshape(-1, 3)
-    belief = m.view.pool.read("belief", k.visible.slots).reshape(-1).astype(np.float64)
-    assert k.messages is not None
-    found = belief - k.messages.to_numpy()[: len(belief)].astype(np.float64)
-    return dict(zip(map(tuple, voxels.tolist()), found.tolist(), strict=True))
-
-
-def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: float) -> dict:
-    """The posterior of each voxel of a ray that it is what the pixel sees."""
-    lowest = reference.logit(config.free_share * prior)
-    visibility, found = 1.0, {}
-    for segment, density in zip(ray.segments, ray.densities, strict=True):
-        if segment.voxel in cavity:
-            m = reference.logistic(min(FineMap.LIMITS.cavity, max(lowest, cavity[segment.voxel])))
-            free = (1 - m) ** segment.length
-            found[segment.voxel] = (1 - free) * density * visibility
-            visibility *= free
-    total = sum(found.values()) + visibility * ray.beyond + config.floor
-    return {voxel: here / total for voxel, here in found.items()}
 
 
 @settings(max_examples=15)
@@ -285,7 +260,7 @@ def test_without_colour_images_there_are_none_and_wrong_ones_are_refused() -> No
     assert not m.has_colors
     assert not m.colors(scene.probes()[:10]).any()
     for wrong in (color[1:], color.astype(float), color[..., 0]):
-        with pytest.raises(KeyframeError, match="a colour image must be uint8 of the shape"):
+        with pytest.raises(KeyframeError, match="the image color must be uint8 of the shape"):
             m.add_keyframe(depth, scene.pose(0.0), scene.CAMERA, color=wrong)
     with pytest.raises(ConfigError, match="log_odds has no colours"):
         LogOddsMap(scene.VOXEL).add_keyframe(depth, scene.pose(0.0), scene.CAMERA, color=color)
@@ -294,11 +269,10 @@ def test_without_colour_images_there_are_none_and_wrong_ones_are_refused() -> No
 def test_shares_add_up_voxel_by_voxel() -> None:
     bricks = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0]], np.int32)
     numbers, ones = np.array([3, 7, 3], np.int32), np.ones(3, np.int64)
-    a = ColorShare(bricks, numbers, ones, 2 * ones)
-    b = ColorShare(bricks[1:], numbers[1:], 10 * ones[1:], ones[1:])
+    a = VoxelShare(bricks, numbers, np.stack([ones, 2 * ones], axis=1))
+    b = VoxelShare(bricks[1:], numbers[1:], np.stack([10 * ones[1:], ones[1:]], axis=1))
     both = b.plus(a)
     np.testing.assert_array_equal(both.bricks, bricks)
     np.testing.assert_array_equal(both.numbers, numbers)
-    np.testing.assert_array_equal(both.rg, [1, 11, 11])
-    np.testing.assert_array_equal(both.bw, [2, 3, 3])
-    assert len(ColorShare.nothing().plus(ColorShare.nothing()).numbers) == 0
+    np.testing.assert_array_equal(both.sums, [[1, 2], [11, 3], [11, 3]])
+    assert len(VoxelShare.nothing(2).plus(VoxelShare.nothing(2)).numbers) == 0

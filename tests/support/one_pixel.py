@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 from oracles import inference as reference
 
+from taichi_mrf.config.sections import InferenceConfig
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import AS_PRINTED
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 VOXEL = 0.1
 ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
@@ -71,3 +74,27 @@ def well_cut(rays: list[reference.Ray], longest: int) -> bool:
     """No corner is grazed (float32 may take the other way round it), and few enough voxels to enumerate."""
     cells = [s for ray in rays for s in ray.segments]
     return all(s.length > 0.02 for s in cells) and all(len(ray.segments) <= longest for ray in rays)
+
+
+def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:
+    """Log-odds of the voxels that a keyframe sees, without its own messages."""
+    bricks = k.footprint.window.bricks_of(k.visible.cells)
+    voxels = (bricks[:, None] * BRICK + offsets_in_brick()).reshape(-1, 3)
+    belief = m.view.pool.read("belief", k.visible.slots).reshape(-1).astype(np.float64)
+    assert k.messages is not None
+    found = belief - k.messages.to_numpy()[: len(belief)].astype(np.float64)
+    return dict(zip(map(tuple, voxels.tolist()), found.tolist(), strict=True))
+
+
+def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: float) -> dict:
+    """The posterior of each voxel of a ray that it is what the pixel sees."""
+    lowest = reference.logit(config.free_share * prior)
+    visibility, found = 1.0, {}
+    for segment, density in zip(ray.segments, ray.densities, strict=True):
+        if segment.voxel in cavity:
+            m = reference.logistic(min(FineMap.LIMITS.cavity, max(lowest, cavity[segment.voxel])))
+            free = (1 - m) ** segment.length
+            found[segment.voxel] = (1 - free) * density * visibility
+            visibility *= free
+    total = sum(found.values()) + visibility * ray.beyond + config.floor
+    return {voxel: here / total for voxel, here in found.items()}

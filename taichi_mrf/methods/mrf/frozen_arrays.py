@@ -1,6 +1,6 @@
 """The contributions of frozen keyframes as arrays of a file, a map's or a parked chunk's."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +9,16 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.inference.brick_sums import LARGEST, VOTES, BrickSums
-from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import NEVER
+from taichi_mrf.inference.voxel_share import VoxelShare
 from taichi_mrf.methods.map_file import read_places
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.system.npz_file import NpzFile
 from taichi_mrf.voxels.distance_field import VALUES
+from taichi_mrf.voxels.layers import FromPixels, pixel_layers
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.topology import SparseTopology
-
-_SHARE = ("bricks", "numbers", "rg", "bw")
 
 _BEFORE_ALL = float(np.finfo(np.float64).min)
 """Stands for no stamp at all: a file holds finite numbers only."""
@@ -96,28 +95,37 @@ def read_waiting(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> list[W
     return [WaitingMessages(s, key.tobytes(), places[part], messages[part]) for s, key, part in rows]
 
 
-def color_arrays(share: ColorShare) -> dict[str, NDArray]:
-    """Arrays of a file: colours by frozen keyframes; none without any."""
-    arrays: dict[str, NDArray] = {f"frozen_color_{name}": getattr(share, name) for name in _SHARE}
-    return arrays if len(share.numbers) else {}
+def share_arrays(shares: Mapping[str, VoxelShare]) -> dict[str, NDArray]:
+    """Arrays of a file: what frozen keyframes gave to layers that pixels feed; none for a layer without
+    any."""
+    arrays: dict[str, NDArray] = {}
+    for name, made in pixel_layers().items():
+        share = shares.get(name)
+        if share is not None and len(share.numbers):
+            arrays |= {f"{made.stored}_bricks": share.bricks, f"{made.stored}_numbers": share.numbers}
+            arrays |= {f"{made.stored}_{w}": share.sums[:, i] for i, w in enumerate(made.words)}
+    return arrays
 
 
-def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> ColorShare:
-    """Colours by frozen keyframes, from a file with bricks (n, 3). Raises MapFileError if it names others."""
-    if "frozen_color_numbers" not in file:
-        return ColorShare.nothing()
-    numbers = file.integers("frozen_color_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
+def read_shares(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> dict[str, VoxelShare]:
+    """What frozen keyframes gave to each layer that pixels feed, from a file with bricks (n, 3). Raises
+    MapFileError if it names others."""
+    return {name: _read_share(path, file, bricks, made) for name, made in pixel_layers().items()}
+
+
+def _read_share(path: Path, file: NpzFile, bricks: NDArray[np.int32], made: FromPixels) -> VoxelShare:
+    stored = made.stored
+    if f"{stored}_numbers" not in file:
+        return VoxelShare.nothing(len(made.words))
+    numbers = file.integers(f"{stored}_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
     n, span = len(numbers), SparseTopology.HALF_SPAN
-    share = ColorShare(
-        file.integers("frozen_color_bricks", (n, 3), -span, span - 1).astype(np.int32),
-        numbers,
-        file.array("frozen_color_rg", "i", (n,)).astype(np.int64),
-        file.array("frozen_color_bw", "i", (n,)).astype(np.int64),
-    )
-    known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
-    if not known or (share.bw <= 0).any():
-        raise MapFileError(f"{path}: damaged: frozen_color_bricks or frozen_color_bw are not of its voxels")
-    return share
+    places = file.integers(f"{stored}_bricks", (n, 3), -span, span - 1).astype(np.int32)
+    words = [file.array(f"{stored}_{word}", "i", (n,)) for word in made.words]
+    sums = np.stack(words, axis=1).astype(np.int64)
+    known = np.isin(grid_keys(places), grid_keys(bricks)).all()
+    if not known or (sums < 0).any() or not sums.any(axis=1).all():
+        raise MapFileError(f"{path}: damaged: {stored}_bricks or its sums are not of its voxels")
+    return VoxelShare(places, numbers, sums)
 
 
 def ray_arrays(share: RayShare) -> dict[str, NDArray]:

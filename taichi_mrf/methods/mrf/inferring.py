@@ -91,7 +91,8 @@ def freeze_keyframe(parts: MapParts, id: int) -> None:
     restore_messages(parts)
     if keyframe.messages is None:
         raise KeyframeError(f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first")
-    parts.colors.freeze(keyframe)
+    for layer in parts.layers.values():
+        layer.freeze(keyframe)
     surfacing.keep_rays(parts, keyframe)
     parts.allocator.freeze(keyframe)
     parts.surfels.freeze(keyframe)

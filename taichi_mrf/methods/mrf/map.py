@@ -26,16 +26,16 @@ from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven
 from taichi_mrf.methods.brick_map import BrickMap, own_parameters, own_section
 from taichi_mrf.methods.mrf import inferring
-from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.methods.mrf.pixel_layer import PixelLayer
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.protocol import MapStatistics
 from taichi_mrf.queries.survey import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
-from taichi_mrf.system import tensors
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -101,7 +101,8 @@ class MRFMap(BrickMap):
         doubt = doubting(DOUBT_FREE, DOUBT_OCCUPIED, self.prior)
         self._make_bricks(config, noise, *log_odds, config.volume, Occlusion(), doubt)
         self._next_id = 0
-        self._parts = MapParts.of(self.config, self.prior, self.view, self._registry, self.LIMITS)
+        parts = (self.config, self.prior, self.view, self._registry, self.LIMITS, inferring.restore_messages)
+        self._parts = MapParts.of(*parts)
         self._keyframes = self._parts.keyframes
         window_m = config.volume.window_m
         self.window = moving_window.MovingWindow(window_m, self._parts) if window_m > 0 else None
@@ -138,6 +139,7 @@ class MRFMap(BrickMap):
         sigma_m: ArrayLike | None = None,
         no_return: ArrayLike | None = None,
         pose_covariance: ArrayLike | None = None,
+        images: Mapping[str, ArrayLike] | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
@@ -150,12 +152,13 @@ class MRFMap(BrickMap):
         without a return: bool, used according to ``sensor.no_return``, or float32, the depth up to which each
         is free (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the pose error xi in
         the camera frame (metres, then radians) where the true pose is T_world_camera exp(xi), None for an
-        exact pose (sensor/pose_doubt.py). Returns the id. Raises KeyframeError for a wrong shape or pose and
-        for an invalid covariance, CapacityError if the map would not fit, ConfigError for wrong noise.
+        exact pose (sensor/pose_doubt.py); ``images`` are others beside depth, by name, from which layers
+        follow (voxels/layers.py). Returns the id. Raises KeyframeError for a wrong shape or pose and for an
+        invalid covariance, CapacityError if the map would not fit, ConfigError for wrong noise.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        given = (color, noise, sigma_m, no_return, pose_covariance)
+        given = (color, noise, sigma_m, no_return, pose_covariance, images)
         # Step 1, intake: axial depth d_r of each pixel, checked and with its noise on the device.
         image = self._parts.image(self.noise, depth_m, camera, *given)
         # Step 2, rays: which are cast and which bricks they cross (section IV-B). Steps 3 to 6 are infer's.
@@ -346,31 +349,15 @@ class MRFMap(BrickMap):
         return self._parts.statistics()
 
     @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour: a keyframe has been added with a colour image."""
-        return bool(self._parts.colors)
-
-    @tensors.in_kind("points")
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how much of
-        the voxel was seen, 0 for nothing. Each pixel's colour is shared among the voxels on its ray by the
-        probability that it saw them, as of the last :meth:`infer`."""
-        return self._current_colors().at(points)
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
-        return self._current_colors().within(slots)
+    def pixel_layers(self) -> Mapping[str, PixelLayer]:
+        """The layers of voxels that pixels feed, by name (voxels/layers.py). What a pixel says is shared
+        among the voxels on its ray by the probability that it saw them, as of the last :meth:`infer`."""
+        return MappingProxyType(self._parts.layers)
 
     def recent_colors(self) -> NDArray[np.uint8]:
         """Colours (slots * 512, 4) while keyframes are added, at the cost of the new ones alone: colours by
-        earlier keyframes are not recomputed (MapColors.follow)."""
-        inferring.restore_messages(self._parts)
-        return self._parts.colors.follow()
-
-    def _current_colors(self) -> MapColors:
-        if not self._parts.colors.is_current:
-            inferring.restore_messages(self._parts)
-        return self._parts.colors
+        earlier keyframes are not recomputed (PixelLayer.follow)."""
+        return self._parts.layers[COLORS].follow()
 
     @property
     def keeps_surface(self) -> bool:

@@ -6,16 +6,14 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_map import BrickMap
-from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.inferring import restore_messages
 from taichi_mrf.methods.mrf.parts import MapParts
+from taichi_mrf.methods.mrf.pixel_layer import PixelLayer
 from taichi_mrf.methods.mrf.surfacing import (
     map_surface,
     measured_depth_of,
@@ -27,7 +25,6 @@ from taichi_mrf.methods.mrf.surfacing import (
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.view import View
-from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.pool import BrickPool
@@ -76,20 +73,10 @@ class MapReading(BrickMap):
         return MappingProxyType(self._parts.keyframes)
 
     @property
-    def has_colors(self) -> bool:
-        """True if any voxel may have a colour."""
-        return bool(self._colors)
-
-    @tensors.in_kind("points")
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours that cameras saw at (N, 3) points in metres by the time that is read, (N, 4)."""
+    def pixel_layers(self) -> Mapping[str, PixelLayer]:
+        """The layers that pixels feed, by the time that is read."""
         self._check()
-        return self._colors.at(points)
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Colours of the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
-        self._check()
-        return self._colors.within(slots)
+        return self._layers
 
     @property
     def has_surface(self) -> bool:
@@ -142,13 +129,11 @@ class MapReading(BrickMap):
         return self._parts.pool.showing_others(self._rays.belief)
 
     @cached_property
-    def _colors(self) -> MapColors:
-        colors = self._parts.colors
-        if not colors.is_current:
-            restore_messages(self._parts)
-        if self._rays is None:
-            return colors
-        return colors.of_some(self._seen, self._judging, self._rays.with_frozen)
+    def _layers(self) -> dict[str, PixelLayer]:
+        layers, rays = self._parts.layers, self._rays
+        if rays is None:
+            return layers
+        return {n: each.of_some(self._seen, self._judging, rays.with_frozen) for n, each in layers.items()}
 
     def _check(self) -> None:
         if self._registry.version != self._version:

@@ -34,7 +34,6 @@ from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layers import (
-    COLORS,
     FIRST,
     LOG_ODDS,
     SURFACE,
@@ -159,7 +158,8 @@ class MovingWindow:
                 self._parts.dated.restore_frozen(slots, *found.dated)
         registry.see_for_good(found.crossed)
         self._parts.surfels.restore(found.surfels)
-        self._parts.colors.restore(found.colors)
+        for name, share in found.shares.items():
+            self._parts.layers[name].restore(share)
         self._parts.kept.restore(found.rays)
 
     def _leave(self, m: VoxelMap, position_m: NDArray[np.float64]) -> None:
@@ -182,14 +182,14 @@ class MovingWindow:
         slots = self._slots_in(chunks)
         contents = self._contents(chunks, slots)
         layers = {LOG_ODDS: self._voxels(chunks, header)}
-        if self._parts.colors:
-            layers[COLORS] = self._parts.colors.frozen_in(chunks).values
+        layers |= {name: each.frozen_values(chunks) for name, each in self._parts.layers.items() if each}
         if self._parts.kept.wanted:
             layers |= self._parts.kept.share.in_chunks(chunks).layers
         self.parked.add(contents, layers, header)
         self._registry.leave(slots, chunks)
         self._parts.surfels.release(chunks)
-        self._parts.colors.release(chunks)
+        for layer in self._parts.layers.values():
+            layer.release(chunks)
         self._parts.kept.release(chunks)
         self._chunks = self.parked.chunks
 
@@ -202,12 +202,11 @@ class MovingWindow:
         surfels = self._parts.surfels.frozen_in(chunks)
         slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
         surfels_of = dict(by_chunk(surfels.cells // BRICK))
-        colors = self._parts.colors.frozen_in(chunks)
-        colors_of = dict(by_chunk(colors.bricks))
+        frozen = {name: layer.frozen.in_chunks(chunks) for name, layer in self._parts.layers.items()}
         rays = self._parts.kept.share.in_chunks(chunks)
         contents = {}
         for x, y, z in chunks.tolist():
-            inside = slots[slots_of.get((x, y, z), _NONE)]
+            inside, chunk = slots[slots_of.get((x, y, z), _NONE)], np.array([[x, y, z]], np.int32)
             contents[x, y, z] = ParkedChunk(
                 pool.bricks[inside],
                 pool.read("total", inside),
@@ -216,16 +215,16 @@ class MovingWindow:
                 frozen_crossed[crossed_of.get((x, y, z), _NONE)],
                 None if self._parts.dated is None else self._parts.dated.read_frozen(inside),
                 surfels.chosen(surfels_of.get((x, y, z), _NONE)),
-                colors.chosen(colors_of.get((x, y, z), _NONE)),
-                rays.in_chunks(np.array([[x, y, z]], np.int32)),
+                {name: share.in_chunks(chunk) for name, share in frozen.items()},
+                rays.in_chunks(chunk),
             )
         return contents
 
     def _resident(
         self, header: StoreHeader, surface: DistanceField | None, first: NDArray[np.uint8] | None
     ) -> Iterator[tuple[NDArray[np.int32], dict[str, BrickValues]]]:
-        """All chunks in memory with their layers, some at a time: colours if these are known, the distances
-        of ``surface``, and what rays say of voxels (slots, 512) beyond marginals, ``first``."""
+        """All chunks in memory with their layers, some at a time: those of pixels if they are known, the
+        distances of ``surface``, and what rays say of voxels (slots, 512) beyond marginals, ``first``."""
         measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
         footprints = [k.footprint for k in self._parts.keyframes.values()]
         crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
@@ -234,9 +233,9 @@ class MovingWindow:
             some = chunks[begin : begin + _AT_ONCE]
             slots = self._slots_in(some)
             bricks, layers = self._registry.pool.bricks[slots], {}
-            colors = self._parts.colors.stored(slots, self._parts.settled)
-            if len(colors):
-                layers[COLORS] = BrickValues(bricks, colors)
+            for name, layer in self._parts.layers.items():
+                if (values := layer.stored(slots, self._parts.settled)) is not None:
+                    layers[name] = BrickValues(bricks, values)
             if first is not None:
                 layers[FIRST] = BrickValues(bricks, first[slots])
             if surface is not None:

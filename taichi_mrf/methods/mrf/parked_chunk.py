@@ -6,6 +6,7 @@ memory and leaves it again with other evidence has another file.
 
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.inference.color_sums import ColorShare
+from taichi_mrf.inference.voxel_share import VoxelShare
 from taichi_mrf.methods.map_file import read_places
 from taichi_mrf.methods.mrf.frozen_arrays import (
-    color_arrays,
     dated_arrays,
     ray_arrays,
-    read_color_share,
     read_dated,
     read_rays,
+    read_shares,
+    share_arrays,
 )
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.system.atomic import write_npz
@@ -42,8 +43,8 @@ class ParkedChunk:
     """``total`` and ``evidence`` are (n, 512) log-odds of the ``bricks`` (n, 3) that have voxels; ``owners``
     (n,) counts the frozen keyframes that own each; ``crossed`` (m, 3) are the bricks that they crossed.
     ``dated`` is, in a dated map, what they say of the voxels (n, 512), and as of when (n); ``surfels`` is the
-    surface that they have measured, if keyframes are aligned; ``colors`` is what they gave to the colours,
-    and ``rays`` what they measured, if that is kept."""
+    surface that they have measured, if keyframes are aligned; ``shares`` are what they gave to layers that
+    pixels feed, and ``rays`` what they measured, if that is kept."""
 
     bricks: NDArray[np.int32]
     total: NDArray[np.float32]
@@ -52,14 +53,14 @@ class ParkedChunk:
     crossed: NDArray[np.int32]
     dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
     surfels: Surfels
-    colors: ColorShare
+    shares: Mapping[str, VoxelShare]
     rays: RayShare
 
     @cached_property
     def _arrays(self) -> dict[str, NDArray]:
         arrays: dict[str, NDArray] = {name: getattr(self, name) for name in _MEMBERS}
         arrays |= {"surfel_keys": self.surfels.keys, "surfel_sums": self.surfels.sums}
-        arrays |= color_arrays(self.colors) | ray_arrays(self.rays)
+        arrays |= share_arrays(self.shares) | ray_arrays(self.rays)
         return arrays if self.dated is None else arrays | dated_arrays(*self.dated)
 
     def file_name(self, chunk: Chunk) -> str:
@@ -100,7 +101,7 @@ def read_parked(path: Path, chunk: Chunk, voxel_size: float) -> ParkedChunk:
             read_places(path, file, "crossed"),
             read_dated(file, n),
             Surfels(keys, file.array("surfel_sums", "f", (len(keys), 7)).astype(np.float64), voxel_size),
-            read_color_share(path, file, bricks),
+            read_shares(path, file, bricks),
             read_rays(path, file),
         )
     for places in (found.bricks, found.crossed, found.rays.distances.bricks, found.rays.votes.bricks):

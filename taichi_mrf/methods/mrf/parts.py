@@ -5,7 +5,7 @@ these functions and has no state beside them.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -15,17 +15,17 @@ from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.incremental import IncrementalInference
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_color, checked_depth
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth, checked_images
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_registry import BrickRegistry
-from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
+from taichi_mrf.methods.mrf.pixel_layer import PixelLayer
 from taichi_mrf.methods.protocol import MapStatistics, measure
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
@@ -34,6 +34,7 @@ from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layers import pixel_layers
 from taichi_mrf.voxels.pool import BrickPool
 
 if TYPE_CHECKING:
@@ -67,8 +68,8 @@ class Once(Generic[FoundT]):
 
 @dataclass
 class MapParts:
-    """``prior`` is a voxel's probability, ``keyframes`` are those that can still be moved and removed,
-    ``frozen`` the names of the others, by id."""
+    """``prior`` is a voxel's probability, ``layers`` are those that pixels feed, by name, ``keyframes`` those
+    that can still be moved and removed, ``frozen`` the names of the others, by id."""
 
     config: Config
     prior: float
@@ -79,7 +80,7 @@ class MapParts:
     sweeper: Sweeper
     incremental: IncrementalInference
     surfels: KeyframeSurfels
-    colors: MapColors
+    layers: dict[str, PixelLayer]
     kept: KeptRays
     decisions: Decisions
     keyframes: dict[int, Keyframe]
@@ -95,7 +96,10 @@ class MapParts:
     calibrated: "Once[ti.Ndarray]" = field(default_factory=Once)
 
     @staticmethod
-    def of(config: Config, prior: float, view: View, registry: BrickRegistry, limits: Limits) -> "MapParts":
+    def of(
+        config: Config, prior: float, view: View, registry: BrickRegistry, limits: Limits,
+        restore_messages: Callable[["MapParts"], object],
+    ) -> "MapParts":  # fmt: skip
         """The parts of an empty map."""
         inference, volume, pool = config.inference, config.volume, registry.pool
         keyframes: dict[int, Keyframe] = {}
@@ -109,9 +113,10 @@ class MapParts:
         note_sweep = None if beliefs is None else beliefs.note_sweep
         renewing = (bounds, allocator.look_again, allocator.refresh, inference.renew_tolerance, note_sweep)
         kept = KeptRays(config.keep_surface)
-        colors = MapColors(registry, keyframes, sweeper, allocator.refresh)
-        registry.on_release = colors.forget
-        return MapParts(
+        fed = (registry, keyframes, sweeper, allocator.refresh, lambda: restore_messages(parts))
+        layers = {name: PixelLayer(name, *fed) for name in pixel_layers()}
+        registry.on_release = [layer.forget for layer in layers.values()]
+        parts: MapParts = MapParts(
             config=config,
             prior=prior,
             view=view,
@@ -121,11 +126,12 @@ class MapParts:
             sweeper=sweeper,
             incremental=IncrementalInference(pool, sweeper, *renewing),
             surfels=KeyframeSurfels(config.voxel_size, config.sensor.max_depth),
-            colors=colors,
+            layers=layers,
             kept=kept,
             decisions=Decisions(registry, keyframes, kept, sweeper),
             keyframes=keyframes,
         )
+        return parts
 
     @property
     def pool(self) -> BrickPool:
@@ -149,25 +155,28 @@ class MapParts:
 
     @property
     def found_bytes(self) -> int:
-        """Bytes of colours, of what frozen keyframes measured, of states and surfaces once asked for."""
+        """Bytes of layers, of what frozen keyframes measured, of states and surfaces once asked for."""
         log_odds = (self.decided.value, self.calibrated.value)
         asked = sum(4 * int(each.shape[0]) for each in log_odds if each is not None)
         surfaces = (self.measured.value, self.rendered.value)
         asked += sum(each.nbytes for each in surfaces if each is not None)
-        return self.colors.nbytes + self.kept.share.nbytes + self.decisions.nbytes + asked
+        asked += sum(layer.nbytes for layer in self.layers.values())
+        return self.kept.share.nbytes + self.decisions.nbytes + asked
 
     def image(
         self, model: NoiseModel, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
         noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
-        pose_covariance: ArrayLike | None,
+        pose_covariance: ArrayLike | None, images: Mapping[str, ArrayLike] | None = None,
     ) -> DepthImage:  # fmt: skip
         """The arguments of MRFMap.add_keyframe, checked, on the device; ``model`` is the map's noise."""
         sensor = self.config.sensor
         depth = checked_depth(depth_m, camera, sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         counts = sensor.no_return != "ignore"
-        own = replace(own, no_return=checked_no_return(no_return, depth_m, camera, counts))
-        image = DepthImage.upload(depth, camera, model, checked_color(color, camera), own)
+        beside = checked_images({"color": color, **(images or {})}, camera)
+        missing = checked_no_return(no_return, depth_m, camera, counts)
+        color, own = beside.pop("color", None), replace(own, no_return=missing, images=beside)
+        image = DepthImage.upload(depth, camera, model, color, own)
         if not self.keyframes:
             warn_of_bad_sigma(image.noise_table, sensor.min_depth, sensor.max_depth)
         return image

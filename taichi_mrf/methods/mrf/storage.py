@@ -6,6 +6,7 @@ the beliefs so that a loaded map answers queries at once, and with dates also wh
 from which what moves follows.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.inference.color_sums import ColorShare
+from taichi_mrf.inference.voxel_share import VoxelShare
 from taichi_mrf.methods.map_file import (
     FORMAT,
     MapHeader,
@@ -25,13 +26,13 @@ from taichi_mrf.methods.map_file import (
 )
 from taichi_mrf.methods.mrf.frozen_arrays import (
     WaitingMessages,
-    color_arrays,
     dated_arrays,
     ray_arrays,
-    read_color_share,
     read_dated,
     read_rays,
+    read_shares,
     read_waiting,
+    share_arrays,
     waiting_arrays,
     waiting_of,
 )
@@ -41,6 +42,8 @@ from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.parts import MapParts
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.system.npz_file import NpzFile
+from taichi_mrf.voxels.layers import LAYERS, pixel_layers
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -52,8 +55,8 @@ class MapContents:
     others of them have still to say;
     ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
-    chunks that are not in memory (parked_chunks.py). ``colors`` (n, 512, 4) are those of the voxels, or (0,
-    512, 4), ``frozen_colors`` what frozen keyframes gave to them, and ``kept`` what they measured."""
+    chunks that are not in memory (parked_chunks.py). ``layers`` are the values (n, 512, ...) of those that
+    pixels feed, ``shares`` what frozen keyframes gave to these, and ``kept`` what they measured."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -66,8 +69,8 @@ class MapContents:
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
     parked: list[str]
-    colors: NDArray[np.uint8]
-    frozen_colors: ColorShare
+    layers: Mapping[str, NDArray]
+    shares: Mapping[str, VoxelShare]
     kept: RayShare
 
 
@@ -84,7 +87,7 @@ def save(m: OccupancyMap, parts: MapParts, next_id: int, path: Path, window: Mov
 def contents_of(header: MapHeader, parts: MapParts, parked: list[str]) -> MapContents:
     """The contents to store; ``parked`` names the files of the chunks that are not in memory."""
     registry, pool, dated = parts.registry, parts.pool, parts.dated
-    slots = pool.in_order
+    slots, layers = pool.in_order, parts.layers.items()
     live = np.zeros(pool.capacity, np.int32)
     for keyframe in parts.keyframes.values():
         live[registry.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
@@ -100,8 +103,8 @@ def contents_of(header: MapHeader, parts: MapParts, parked: list[str]) -> MapCon
         registry.frozen_crossed,
         parts.frozen,
         parked,
-        parts.colors.stored(slots, header.settled),
-        parts.colors.frozen,
+        {name: found for name, layer in layers if (found := layer.stored(slots, header.settled)) is not None},
+        {name: layer.frozen for name, layer in layers},
         parts.kept.share,
     )
 
@@ -112,7 +115,8 @@ def place_contents(contents: MapContents, parts: MapParts) -> NDArray[np.int32]:
     if len(contents.bricks):
         slots = parts.registry.restore(contents.bricks, contents.frozen_owners)
     parts.registry.see_for_good(contents.frozen_crossed)
-    parts.colors.restore(contents.frozen_colors)
+    for name, share in contents.shares.items():
+        parts.layers[name].restore(share)
     parts.kept.restore(contents.kept)
     parts.frozen = dict(contents.frozen)
     for k in contents.header.keyframes:
@@ -136,7 +140,8 @@ def show_contents(contents: MapContents, parts: MapParts, slots: NDArray[np.int3
         show(parts, slots, contents.belief)
         if dated is not None and contents.total is not None:
             pool.write("total", slots, contents.total)
-        parts.colors.show(slots, contents.colors)
+        for name, values in contents.layers.items():
+            parts.layers[name].show(slots, values)
     parts.messages_lost, parts.settled = bool(parts.keyframes), contents.header.settled
 
 
@@ -161,9 +166,8 @@ def write_contents(path: Path, contents: MapContents) -> None:
         arrays |= dated_arrays(*contents.frozen_dated) | waiting_arrays(contents.waiting)
     if contents.waiting:
         arrays["format"] = np.asarray(FORMAT)  # a version that passes over them would lose evidence
-    if len(contents.colors) and contents.colors.any():
-        arrays["colors"] = contents.colors
-    arrays |= color_arrays(contents.frozen_colors) | ray_arrays(contents.kept)
+    arrays |= {name: values for name, values in contents.layers.items() if values.any()}
+    arrays |= share_arrays(contents.shares) | ray_arrays(contents.kept)
     write_npz(path, arrays, manifest=True)
 
 
@@ -189,9 +193,13 @@ def read_contents(path: Path) -> MapContents:
             read_places(path, file, "frozen_crossed"),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
             file.array("parked", "U", (None,)).tolist() if "parked" in file else [],
-            file.integers("colors", (n, VOXELS, 4), 0, 255).astype(np.uint8)
-            if "colors" in file
-            else np.zeros((0, VOXELS, 4), np.uint8),
-            read_color_share(path, file, bricks),
+            {name: _read_layer(file, name, n) for name in pixel_layers() if name in file},
+            read_shares(path, file, bricks),
             read_rays(path, file),
         )
+
+
+def _read_layer(file: NpzFile, name: str, bricks: int) -> NDArray:
+    layer, shape = LAYERS[name], (bricks, VOXELS, *LAYERS[name].shape)
+    range_ = np.iinfo(layer.dtype)
+    return file.integers(name, shape, range_.min, range_.max).astype(layer.dtype)
