@@ -3,8 +3,8 @@ make them.
 
 A layer that pixels feed (colours; ``from_pixels``) is an entry here and the visitor that it names: what a
 ray's posterior adds to a voxel's sums (inference/pixel_pass.py). Adding and removing keyframes, freezing,
-saving, loading, windows, chunks, readings of other times and exports in chunks loop over the table, and so
-does the check of the images beside depth (``add_keyframe(images=...)``).
+saving, loading, windows, chunks, readings of other times and exports (.ply points, .npz, .zarr) loop over the
+table, and so does the check of the images beside depth (``add_keyframe(images=...)``, ``Frame.images``).
 
 A layer of another source is an entry, and a value where the source is read (export/chunk_blocks.py for maps
 in memory).
@@ -61,6 +61,11 @@ class Layer:
     def shape(self) -> tuple[int, ...]:
         """The shape of one voxel's values: none for a width of 1."""
         return (self.width,) if self.width > 1 else ()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one voxel's values."""
+        return self.width * np.dtype(self.dtype).itemsize
 
     @property
     def chunk_shape(self) -> tuple[int, ...]:
