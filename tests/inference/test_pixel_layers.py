@@ -2,9 +2,11 @@
 package does not know (support/label_layer.py) is counted by the posterior, and is exact under edits, in
 files, in windows, in chunks and for other times."""
 
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import colored_scene as scene
 import numpy as np
@@ -13,7 +15,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from inputs_frames import Frames
-from label_layer import CLASSES, ENTRY, LABELS
+from label_layer import CLASSES, ENTRY, LABELS, PAGE
 from one_pixel import VOXEL, FineMap, cavities, look_along, spread
 from oracles import inference as reference
 from oracles.forward import Noise
@@ -26,15 +28,25 @@ from taichi_mrf.errors import ConfigError, KeyframeError, MapFileError
 from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
+from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.mapping.merging import frame_of
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.colored import shown_colors
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.voxels.layers import LAYERS
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.shown_extras import ShownColors
+from taichi_mrf.viewer.messages import pack_log_odds
+from taichi_mrf.viewer.scene import coloring
+from taichi_mrf.viewer.scene.coloring import COLORINGS, legend_html
+from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.viewer.scene.voxel_layer import look_of
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore, facing
+from taichi_mrf.voxels.layers import COLORS, LAYERS
 
 pytestmark = pytest.mark.usefixtures("backend", "label_entry")
 
@@ -296,3 +308,36 @@ def test_exports_without_values_do_not_name_it(tmp_path: Path) -> None:
         export_map(m, tmp_path / f"without_{name}")
         LAYERS[LABELS] = ENTRY
         assert (tmp_path / f"with_{name}").read_bytes() == (tmp_path / f"without_{name}").read_bytes()
+
+
+def test_the_page_colours_voxels_by_it_with_a_legend(monkeypatch: pytest.MonkeyPatch) -> None:
+    by_the_table = runpy.run_path(coloring.__file__)["COLORINGS"]
+    assert by_the_table.keys() - COLORINGS.keys() == {PAGE.coloring}
+    monkeypatch.setitem(COLORINGS, PAGE.coloring, by_the_table[PAGE.coloring])
+    m, store = build([0, 1, 2]), VoxelStore()
+    slots = m.view.pool.in_use
+    store.put(m.view.pool.bricks[slots], log_odds=pack_log_odds(m.view.pool.read("belief", slots)))
+    find = ShownColors(cast(Mapper, SimpleNamespace(map=m)))
+    sent = find.changes()
+    assert {update.layer for update in sent} == {COLORS, LABELS}
+    assert not find.changes()
+    for update in sent:
+        store.put(update.bricks, **{update.layer: update.colors})
+    seen = {}
+    for name in ("photo", PAGE.coloring):
+        look = look_of(ViewOptions(color_by=name, shade=False), store, Z_UP, scene.VOXEL)
+        for key in store.chunks:
+            shown = store.shown(key, 0.0, None)
+            centres_m = (shown.cells + np.array(key) * 64 + 0.5) * scene.VOXEL
+            colors = look.paint(shown, shown.cells, scene.VOXEL, np.zeros(3), facing(shown.cells))
+            seen |= {(name, *at): rgb for at, rgb in zip(centres_m.tolist(), colors.tolist(), strict=True)}
+        legend = legend_html(look.scale)
+        assert ("class 7" in legend and PAGE.caption in legend) == (name == PAGE.coloring)
+    points = np.array([at[1:] for at in seen if at[0] == PAGE.coloring])
+    counts, photo = m.pixel_layers[LABELS].at(points), shown_colors(m, points)
+    told = counts.any(axis=1)
+    assert told.sum() > 100
+    for point, count, rgb in zip(points, counts, photo, strict=True):
+        class_color = [30 * (count.argmax() + 1), 255 - 30 * (count.argmax() + 1), 40]
+        assert seen[(PAGE.coloring, *point)] == (class_color if count.any() else [128] * 3)
+        assert seen[("photo", *point)] == rgb.tolist()
