@@ -29,6 +29,7 @@ from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.geometry.up import Z_UP
+from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.merging import frame_of
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
@@ -39,7 +40,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.session.mapper import Mapper
-from taichi_mrf.session.shown_extras import ShownColors
+from taichi_mrf.session.shown_extras import BaselineOverlay, ShownColors
 from taichi_mrf.viewer.messages import pack_log_odds
 from taichi_mrf.viewer.scene import coloring
 from taichi_mrf.viewer.scene.coloring import COLORINGS, legend_html
@@ -341,3 +342,18 @@ def test_the_page_colours_voxels_by_it_with_a_legend(monkeypatch: pytest.MonkeyP
         class_color = [30 * (count.argmax() + 1), 255 - 30 * (count.argmax() + 1), 40]
         assert seen[(PAGE.coloring, *point)] == (class_color if count.any() else [128] * 3)
         assert seen[("photo", *point)] == rgb.tolist()
+
+
+def test_a_live_run_edits_keyframes_with_it_and_its_baseline_does_without() -> None:
+    m, depth = MRFMap(scene.VOXEL, scene.NOISE), scene.view(0.0)[0]
+    image = np.full(scene.CAMERA.shape, 3, np.uint8)
+    frame = Frame(depth, scene.pose(0.0), scene.CAMERA, 3.0, "first", images={LABELS: image})
+    mapper, id = Mapper(m), m.add(frame)
+    entry = mapper.enter(Added(frame, id, m.keyframes[id].rays))
+    baseline = BaselineOverlay(m.config, m.noise)
+    assert baseline.catch_up(mapper, lambda progress: True)
+    assert len(baseline.map.keyframes) == 1
+    mapper.switch(entry.id, on=False)
+    mapper.switch(entry.id, on=True)
+    (again,) = m.keyframes.values()
+    np.testing.assert_array_equal(again.beside(LABELS), image)
