@@ -178,22 +178,23 @@ class Resampled(Derived):
         if frame.depth_m.shape != self.source.camera.shape:
             raise FrameError(f"{frame.name}: the image has the shape {frame.depth_m.shape}")
         outside = self.rows < 0
-        depth_m = frame.depth_m[self.rows, self.columns]
-        depth_m[outside] = 0.0
-        color = None
-        if frame.color is not None:
-            color = frame.color[self.rows, self.columns]
-            color[outside] = 0
         sigma_m = None if frame.sigma_m is None else frame.sigma_m[self.rows, self.columns]
         no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] * ~outside
         return replace(
             frame,
-            depth_m=depth_m,
+            depth_m=self._picked(frame.depth_m),
             camera=self._camera(frame),
-            color=color,
+            color=None if frame.color is None else self._picked(frame.color),
             sigma_m=sigma_m,
             no_return=no_return,
+            images={name: self._picked(image) for name, image in frame.images.items()},
         )
+
+    def _picked(self, image: NDArray) -> NDArray:
+        """The pixels of an image, 0 for those without a recorded one."""
+        found = image[self.rows, self.columns]
+        found[self.rows < 0] = 0
+        return found
 
     def _camera(self, frame: Frame) -> Camera:
         """The camera of the pixels that are kept of a frame."""

@@ -177,7 +177,7 @@ class ChunkStore:
         """One of :attr:`layers` of one of :attr:`chunks`, (64, 64, 64), with a last axis for one of more than
         one value. Raises MapFileError."""
         layer, last = LAYERS[name], _last_axis(name)
-        size = int(np.prod(layer.chunk_shape)) * np.dtype(layer.dtype).itemsize
+        size = CHUNK_VOXELS**3 * layer.nbytes
         file = self.path / self.file_of(name, chunk)
         if name == LOG_ODDS and self._layout.every_chunk and not exists(file):
             raise MapFileError(f"{file}: damaged: there is no such file, which holds a part of the map")

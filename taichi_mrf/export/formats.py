@@ -5,7 +5,8 @@ An .npz file holds plain arrays, which NumPy alone can read.
 metres, along each axis. ``probability`` (n,) float32: of being occupied. ``state`` (n,) int8: 1 free, 2
 occupied. ``free_bricks`` (k, 3) int32: free cubes of 8 voxels a side, whose voxels are not listed; brick i
 covers [8 i, 8 i + 8) voxels. ``prior``: the probability of unknown voxels. ``origin`` (3,): where
-the map's origin is in the recorded world, unless that is 0.
+the map's origin is in the recorded world, unless that is 0. Layers that pixels feed, but for colours, have
+their values (n, ...) of the voxels under their names (voxels/layers.py).
 """
 
 import difflib
@@ -28,7 +29,7 @@ from taichi_mrf.export.map_server import LevelMap, grey_image, level_map, write_
 from taichi_mrf.export.map_sink import CLOUD, COSTMAP, OCTOMAP, PATH, SURFACE, MapSink, Points
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.export.ply import NO_ORIGIN, write_surface, write_voxels
+from taichi_mrf.export.ply import NO_ORIGIN, layers_at, write_surface, write_voxels
 from taichi_mrf.export.rerun_file import require_rerun, write_rrd
 from taichi_mrf.export.robot_messages import require_libraries as require_message_libraries
 from taichi_mrf.export.robot_messages import write_mcap
@@ -36,14 +37,14 @@ from taichi_mrf.export.surface import Surface, photographed, smooth_surface, vox
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
 from taichi_mrf.queries.cells import standing_cells
-from taichi_mrf.queries.colored import shown_colors
+from taichi_mrf.queries.colored import beside_colors, shown_colors
 from taichi_mrf.queries.known_bricks import BrickReader, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, probability
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path, write_npz
 from taichi_mrf.system.libraries import library
 from taichi_mrf.system.memory import check_memory
-from taichi_mrf.voxels.layers import COLORS
+from taichi_mrf.voxels.layers import COLORS, LAYERS
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 _DEFAULTS = ExportOptions()
@@ -140,7 +141,8 @@ def _points_or_surface(m: VoxelMap, path: Path, options: ExportOptions) -> list[
     if options.cubes or options.mesh:
         return _surface(m, path, options)
     centres, p, sizes, colors = _points(m.decided, path, options)
-    write_voxels(path, centres, p, m.voxel_size, colors, sizes, m.config.volume.origin)
+    layers = layers_at(m.decided, centres)
+    write_voxels(path, centres, p, m.voxel_size, colors, sizes, m.config.volume.origin, layers)
     return [path]
 
 
@@ -293,9 +295,9 @@ def _chunks(m: VoxelMap, path: Path, options: ExportOptions) -> list[Path]:
     kept = options.surface == "rays" or (options.surface == "auto" and m.config.keep_surface)
     measured = _with_rays(m, path, options) if kept else None
     up = _up(m, options) if options.up != "auto" else None
-    fed = {name: layer for name, layer in m.pixel_layers.items() if layer}
-    if _photo(m, path, options) is None:
-        fed.pop(COLORS, None)
+    fed = beside_colors(m)
+    if _photo(m, path, options) is not None:
+        fed[COLORS] = m.pixel_layers[COLORS]
     write_chunks(path, m, up, fed, measured)
     return [path]
 
@@ -382,19 +384,25 @@ def write_mesh(
 
 def write_arrays(path: str | Path, m: VoxelMap) -> None:
     """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
-    reader = BrickReader(m.decided)
+    reader, layers = BrickReader(m.decided), beside_colors(m.decided)
     count = len(reader.bricks) * VOXELS
-    check_memory(_BYTES_PER_VOXEL * count, f"{count / 1e6:.3g} million voxels as arrays")
+    bytes_per_voxel = _BYTES_PER_VOXEL + sum(2 * LAYERS[name].nbytes for name in layers)
+    check_memory(bytes_per_voxel * count, f"{count / 1e6:.3g} million voxels as arrays")
     voxels, probabilities, states = (
         [np.zeros((0, 3), np.int32)],
         [np.zeros(0, np.float32)],
         [np.zeros(0, np.int8)],
     )
+    of_layers: dict[str, list[NDArray]] = {
+        name: [np.zeros((0, *LAYERS[name].shape), LAYERS[name].dtype)] for name in layers
+    }
     for bricks, log_odds, state in reader.batches(reader.bricks):
         row, number = np.nonzero(state != UNKNOWN)
         voxels.append(bricks[row] * BRICK + offsets_in_brick()[number])
         probabilities.append(probability(log_odds[row, number]))
         states.append(state[row, number])
+        for name, layer in layers.items():
+            of_layers[name].append(layer.within(reader.slots(bricks))[row, number])
     arrays: dict[str, NDArray[Any]] = {
         "voxels": np.concatenate(voxels),
         "probability": np.concatenate(probabilities),
@@ -405,4 +413,5 @@ def write_arrays(path: str | Path, m: VoxelMap) -> None:
     }
     if any(m.config.volume.origin):
         arrays["origin"] = np.array(m.config.volume.origin)
+    arrays |= {name: np.concatenate(values) for name, values in of_layers.items()}
     write_npz(path, arrays)

@@ -3,22 +3,24 @@
 All are binary and little-endian; a table of named columns defines a vertex.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.queries.change import STATES, MapChange
-from taichi_mrf.queries.colored import shown_colors
+from taichi_mrf.queries.colored import beside_colors, shown_colors
 from taichi_mrf.queries.points import OCCUPIED
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
+from taichi_mrf.voxels.layers import LAYERS
 
 _COLOR = [(name, "u1") for name in ("red", "green", "blue")]
 _TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint", "i4": "int"}
 NO_ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -30,6 +32,7 @@ def write_voxels(
     colors: NDArray[np.uint8] | None = None,
     sizes: NDArray[np.floating] | None = None,
     origin_m: tuple[float, float, float] = NO_ORIGIN,
+    layers: Mapping[str, NDArray] = MappingProxyType({}),
 ) -> None:
     """Write voxels as one coloured point each. Raises MapFileError.
 
@@ -37,6 +40,8 @@ def write_voxels(
     the property ``occupancy``, its marginal (N,), and its colour: of ``colors`` (N, 3), which cameras saw, or
     the one that stands for the marginal. With ``sizes`` (N,), in metres, some are cells of several voxels,
     and ``size`` is a property too. Positions are in a world whose origin is ``origin_m`` in the recorded one.
+    ``layers`` hold values of other layers by name, (N, ...): properties of that name, numbered where a voxel
+    has several.
     """
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
@@ -47,6 +52,11 @@ def write_voxels(
     if sizes is not None:
         extra["size"] = np.asarray(sizes, "<f4")
         comments.append("size is the side in metres of the voxel, or of a cell that stands in for several")
+    for layer, values in layers.items():
+        comments.append(f"{layer} is {LAYERS[layer].about}")
+        columns = values.reshape(len(values), -1).T
+        names = [layer] if len(columns) == 1 else [f"{layer}_{number}" for number in range(len(columns))]
+        extra |= dict(zip(names, columns, strict=True))
     shown = marginal_colors(probability) if colors is None else colors
     write_points(path, centres, shown, extra, comments, origin_m)
 
@@ -54,6 +64,12 @@ def write_voxels(
 def photo_at(m: VoxelMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
     """Colours that cameras saw at points (N, 3) in metres, for :func:`write_voxels`; None without any."""
     return shown_colors(m, points) if m.has_colors else None
+
+
+def layers_at(m: VoxelMap, points: NDArray[np.floating]) -> dict[str, NDArray]:
+    """Values (N, ...) of a map's other layers that pixels feed, of the voxels that hold points (N, 3) in
+    metres, for :func:`write_voxels`."""
+    return {name: layer.at(points) for name, layer in beside_colors(m).items()}
 
 
 def write_points(
@@ -64,8 +80,8 @@ def write_points(
     comments: Sequence[str],
     origin_m: tuple[float, float, float] = NO_ORIGIN,
 ) -> None:
-    """Write points (N, 3) in metres with colours (N, 3) and further properties (N,) by name, float32 or
-    uint8 each. Raises MapFileError."""
+    """Write points (N, 3) in metres with colours (N, 3) and further properties (N,) by name. Raises
+    MapFileError."""
     _write(path, _vertices(points, colors, extra, origin_m), None, comments)
 
 

@@ -34,7 +34,7 @@ from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Struct, Templ
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
-from taichi_mrf.voxels.layers import FromPixels
+from taichi_mrf.voxels.layers import FromPixels, imported
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool
@@ -178,7 +178,7 @@ class PixelPass:
     """Follows the rays of keyframes and adds up what a layer's voxels get; owns the scratch, which grows."""
 
     def __init__(self, sweeper: Sweeper, made: FromPixels) -> None:
-        self._sweeper, self._made, self._visitor = sweeper, made, made.load_visitor()
+        self._sweeper, self._made, self._visitor = sweeper, made, imported(made.visitor)
         self._words = len(made.words)
         self._sums, self._clean = ti.ndarray(ti.i64, VOXELS * self._words), False  # clean: all 0
 

@@ -161,6 +161,7 @@ def frame_of(keyframe: Keyframe) -> Frame:
         sigma_m=keyframe.own.sigma_m,
         noise=keyframe.own.noise,
         no_return=keyframe.own.no_return,
+        images=keyframe.own.images,
     )
 
 

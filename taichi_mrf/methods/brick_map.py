@@ -162,13 +162,14 @@ class BrickMap(PixelReader, Owned):
 
     def add(self, frame: Frame) -> int:
         """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. The configuration
-        decides which of the frame's noise, missing returns and colours are used. The first frame sets the
-        map's origin in the recorded world. Raises the errors of ``add_keyframe``, and ConfigError for a frame
-        of another origin."""
+        decides which of the frame's noise and missing returns are used, the method if its images are. The
+        first frame sets the map's origin in the recorded world. Raises the errors of ``add_keyframe``, and
+        ConfigError for a frame of another origin."""
         config = _at_origin_of(frame, self.config, is_empty=self.up is None)
-        color = frame.color if self.METHOD.has_colors else None
+        color, images = (frame.color, frame.images) if self.METHOD.has_colors else (None, {})
+        own = dataclasses.replace(frame.own_in(config), images=images)
         parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
-        id = self.add_keyframe(frame.depth_m, *parts, **frame.own_in(config).arguments())
+        id = self.add_keyframe(frame.depth_m, *parts, **own.arguments())
         self.config = config  # not before the frame is in
         return id
 

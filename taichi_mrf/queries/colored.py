@@ -1,4 +1,4 @@
-"""The colours of a map's voxels, for whoever draws or writes them.
+"""The colours of a map's voxels, and what else pixels gave to them, for whoever draws or writes them.
 
 A colour is four uint8: red, green, blue, and how much of the voxel cameras have seen, 255 for much and 0 for
 nothing at all, in which case there is no colour.
@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader
-from taichi_mrf.queries.voxel_map import VoxelMap
+from taichi_mrf.queries.voxel_map import PixelValues, VoxelMap
 from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 _POINTS_AT_ONCE = 1 << 19
+
+
+def beside_colors(m: VoxelMap) -> dict[str, PixelValues]:
+    """The layers of a map that pixels feed but for colours, by name; those with values."""
+    return {name: layer for name, layer in m.pixel_layers.items() if layer and name != COLORS}
 
 
 def shown_colors(m: VoxelMap, points: ArrayLike) -> NDArray[np.uint8]:

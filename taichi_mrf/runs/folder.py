@@ -25,7 +25,7 @@ from taichi_mrf.evaluation.noise_fit import CONTRADICTED, DOUBTED, NoiseCheck, c
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.export.ply import photo_at, write_voxels
+from taichi_mrf.export.ply import layers_at, photo_at, write_voxels
 from taichi_mrf.export.trajectory import CAMERA_AXES, LIDAR_AXES, write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import window_of
@@ -208,9 +208,8 @@ def write_voxel_file(path: Path, m: OccupancyMap) -> int:
     """Write the occupied voxels, of a map with a window as of its last save, in the colours that cameras saw
     if the map has them; returns their number. Raises MapFileError."""
     centres, probability = (in_chunks(m) or m).decided.voxels(min_probability=0.5)
-    write_voxels(
-        path, centres, probability, m.voxel_size, photo_at(m, centres), origin_m=m.config.volume.origin
-    )
+    shown = photo_at(m, centres), None, m.config.volume.origin, layers_at(m, centres)
+    write_voxels(path, centres, probability, m.voxel_size, *shown)
     return len(centres)
 
 

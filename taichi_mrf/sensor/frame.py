@@ -1,6 +1,7 @@
 """One measurement of a depth camera or a lidar, whatever it was recorded with."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,9 @@ class Frame:
     ``depth_m`` is depth along the camera's rays, (H, W) float32 in metres; 0 means no measurement. It is
     axial depth for a pinhole, and range where rays have the length 1, as a lidar's have. ``T_world_camera``
     is (4, 4) float64. ``stamp`` is in seconds. ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0
-    where a pixel has none, or None. ``name`` is what error messages and reports call this frame.
+    where a pixel has none, or None. ``images`` are others of the same pixels, by the names that layers of
+    voxels have for them (voxels/layers.py), uint8. ``name`` is what error messages and reports call this
+    frame.
 
     The other fields are None if the sensor's configuration holds for the frame: ``sigma_m``, (H, W) float32,
     the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
@@ -49,6 +52,7 @@ class Frame:
     gyro: "GyroSamples | None" = None
     acceleration: "AccelerationSamples | None" = None
     origin_m: tuple[float, ...] | None = None
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
     @property
     def points_m(self) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ only on its keyframes and their poses, bit for bit.
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -390,9 +390,8 @@ class Mapper:
                 f"keyframe {entry.id} ({entry.name}) is frozen: its depth image is no longer in memory"
             )
         own = self._keyframe(entry).own if entry.state == "on" else entry.own
-        return StoredKeyframe(
-            entry.id, entry.name, depth_m, entry.T_world_camera, entry.camera, entry.stamp_s, None, own
-        )
+        place = entry.T_world_camera, entry.camera, entry.stamp_s
+        return StoredKeyframe(entry.id, entry.name, depth_m, *place, None, replace(own, images={}))
 
     def posed_images_near(self, point: NDArray[np.float64]) -> Iterator[StoredKeyframe]:
         """All keyframes that are on, the nearest to a point first."""

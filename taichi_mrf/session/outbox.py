@@ -118,7 +118,7 @@ class Outbox:
         if isinstance(update, KeyframeInfo):
             return "keyframe", update.id
         if isinstance(update, BrickColors):
-            return "colors", update.chunk
+            return update.layer, update.chunk
         if isinstance(update, SurfacePatch):
             return "surface", update.chunk
         if isinstance(update, Hello):

@@ -31,6 +31,7 @@ from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
+from taichi_mrf.voxels.layers import COLORS
 
 RATE_SECONDS = 5.0
 """Seconds over which the rates of keyframes and of frames are averaged."""
@@ -205,6 +206,7 @@ class Run(SessionCore):
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,
                 has_colors=takes_colors(m) and (self.source.config.color or m.has_colors),
+                layers=tuple(name for name in m.pixel_layers if name != COLORS),
                 has_surface=measures_surface(m),
                 counts_keyframes=has_messages(m),
                 has_frames=self.source.new_replay is not None,

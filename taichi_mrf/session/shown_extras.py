@@ -29,7 +29,6 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.queries.changed_things import find_changed_things, without_slack
-from taichi_mrf.queries.colored import painted
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.session.mapper import Mapper
 from taichi_mrf.session.publish import Publisher
@@ -42,9 +41,8 @@ from taichi_mrf.viewer.messages import (
     SurfaceView,
     Update,
 )
+from taichi_mrf.voxels.layers import LAYERS, Chunk, imported, pixel_layers
 from taichi_mrf.voxels.layout import BRICK, VOXELS, by_chunk, grid_keys
-
-Chunk = tuple[int, int, int]
 
 
 class ShownSurface:
@@ -235,12 +233,12 @@ crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free n
 
 
 class ShownColors:
-    """Finds the colours to send of one map. While keyframes come, only theirs are added; once the map has
-    settled, all are computed from its final marginals."""
+    """Finds the colours to send of one map, of each layer that pixels feed. While keyframes come, only what
+    these give is added; once the map has settled, all is computed from its final marginals."""
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
-        self._sent: dict[tuple[int, int, int], bytes] = {}
+        self._sent: dict[tuple[str, Chunk], bytes] = {}
         self._next = -math.inf
         self._seen: tuple[int, bool, int] | None = None
 
@@ -248,7 +246,10 @@ class ShownColors:
         """The colours of the chunks that have changed since the last call, chunk by chunk; none if that was a
         moment ago."""
         m, begin = self._mapper.map, time.monotonic()
-        if not takes_colors(m) or not m.has_colors or (begin < self._next and not m.settled):
+        if not takes_colors(m) or (begin < self._next and not m.settled):
+            return []
+        layers = {name: layer for name, layer in m.pixel_layers.items() if layer}
+        if not layers:
             return []
         pool = m.view.pool
         state = pool.revision, m.settled, len(m.keyframes)
@@ -256,14 +257,17 @@ class ShownColors:
             return []
         self._seen = state
         slots = pool.in_use
-        found = m.colors_in(slots) if m.settled else m.recent_colors().reshape(-1, VOXELS, 4)[slots]
         news = []
-        for chunk, rows in by_chunk(pool.bricks[slots]):
-            colors = painted(found[rows])
-            digest = hashlib.blake2b(colors.tobytes(), digest_size=8).digest()
-            if self._sent.get(chunk) != digest:
-                self._sent[chunk] = digest
-                news.append(BrickColors(chunk, np.ascontiguousarray(pool.bricks[slots[rows]]), colors))
+        for name, layer in layers.items():
+            painted, shape = imported(pixel_layers()[name].page.painted), (-1, VOXELS, *LAYERS[name].shape)
+            found = layer.within(slots) if m.settled else layer.follow().reshape(shape)[slots]
+            for chunk, rows in by_chunk(pool.bricks[slots]):
+                colors = painted(found[rows])
+                digest = hashlib.blake2b(colors.tobytes(), digest_size=8).digest()
+                if self._sent.get((name, chunk)) != digest:
+                    self._sent[name, chunk] = digest
+                    bricks = np.ascontiguousarray(pool.bricks[slots[rows]])
+                    news.append(BrickColors(chunk, bricks, colors, name))
         now = time.monotonic()
         self._next = now + (now - begin) / COLOR_SHARE
         return news

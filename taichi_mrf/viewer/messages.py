@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.voxels.layers import COLORS
 
 LOG_ODDS_STEP = 1 / 512
 """Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
@@ -61,6 +62,8 @@ class Hello(Update):
     """True if the map can be shown as of another time."""
     has_colors: bool = False
     """True if voxels have the colours that cameras saw."""
+    layers: tuple[str, ...] = ()
+    """Names of other layers that pixels feed, of which frames may tell (voxels/layers.py)."""
     has_surface: bool = False
     """True if the map can make the surface that its keyframes measured."""
     counts_keyframes: bool = True
@@ -92,12 +95,13 @@ class Bricks(Update):
 
 @dataclass(frozen=True)
 class BrickColors(Update):
-    """The colours that cameras saw, of the voxels of all bricks of a ``chunk``: ``bricks`` (n, 3) int32,
-    ``colors`` (n, 512, 3) uint8 RGB."""
+    """The colours that a ``layer`` gives to the voxels of all bricks of a ``chunk``, by default what cameras
+    saw: ``bricks`` (n, 3) int32, ``colors`` (n, 512, 3) uint8 RGB."""
 
     chunk: tuple[int, int, int]
     bricks: NDArray[np.int32]
     colors: NDArray[np.uint8]
+    layer: str = COLORS
 
 
 @dataclass(frozen=True)
@@ -407,8 +411,8 @@ class PixelRay(Request):
 class Watch(Request):
     """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
     keyframe, or None for the current camera), the baseline beside the map, the ``counts`` of keyframes that
-    see each voxel (else sent as 0), the ``colors`` of voxels, the measured ``surface``, and the measured
-    ``points`` of a keyframe."""
+    see each voxel (else sent as 0), the ``colors`` that pixels give to voxels, the measured ``surface``, and
+    the measured ``points`` of a keyframe."""
 
     images: bool
     view: int | None

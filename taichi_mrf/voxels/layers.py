@@ -3,8 +3,9 @@ make them.
 
 A layer that pixels feed (colours; ``from_pixels``) is an entry here and the visitor that it names: what a
 ray's posterior adds to a voxel's sums (inference/pixel_pass.py). Adding and removing keyframes, freezing,
-saving, loading, windows, chunks, readings of other times and exports in chunks loop over the table, and so
-does the check of the images beside depth (``add_keyframe(images=...)``).
+saving, loading, windows, chunks, readings of other times and exports (.ply points, .npz, .zarr) loop over the
+table, and so do the page's colourings and the check of the images beside depth (``add_keyframe(images=...)``,
+``Frame.images``).
 
 A layer of another source is an entry, and a value where the source is read (export/chunk_blocks.py for maps
 in memory).
@@ -25,13 +26,27 @@ Chunk = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
+class OnPage:
+    """How the page shows a layer that pixels feed: the name of its ``coloring`` there, its ``help``, and the
+    ``caption`` of its legend with a ``key``, RGB by what it means. ``painted`` is the module and the name of
+    a function from values (n, 512, ...) to RGB (n, 512, 3), colors.NO_COLOR where nothing is known."""
+
+    coloring: str
+    help: str
+    caption: str
+    painted: str
+    key: tuple[tuple[str, tuple[int, int, int]], ...] = ()
+
+
+@dataclass(frozen=True)
 class FromPixels:
     """How a layer follows from an image beside depth.
 
     ``image`` is the argument of ``add_keyframe``, or the name among its ``images``; ``channels`` uint8 of a
     pixel, all 0 where it says nothing. ``visitor`` is the module and the class of its PixelVisitor, loaded
     when a map is first asked for the layer. A voxel's sums are int64 ``words``, each of which holds two
-    numbers; ``stored`` and the words' names are those of what frozen keyframes gave, in files.
+    numbers; ``stored`` and the words' names are those of what frozen keyframes gave, in files. ``page`` is
+    how it is shown.
     """
 
     image: str
@@ -39,11 +54,13 @@ class FromPixels:
     visitor: str
     stored: str
     words: tuple[str, ...]
+    page: OnPage
 
-    def load_visitor(self) -> Any:
-        """The visitor's class, imported now."""
-        module, _, name = self.visitor.partition(":")
-        return getattr(importlib.import_module(module), name)
+
+def imported(place: str) -> Any:
+    """What a module and a name stand for, imported now."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 @dataclass(frozen=True)
@@ -63,6 +80,11 @@ class Layer:
         return (self.width,) if self.width > 1 else ()
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of one voxel's values."""
+        return self.width * np.dtype(self.dtype).itemsize
+
+    @property
     def chunk_shape(self) -> tuple[int, ...]:
         """The shape of a chunk's values."""
         return (CHUNK_VOXELS, CHUNK_VOXELS, CHUNK_VOXELS, *self.shape)
@@ -70,8 +92,12 @@ class Layer:
 
 LOG_ODDS, COLORS, SURFACE, FIRST = "log_odds", "colors", "surface", "first_surface"
 
+_PHOTO = OnPage(
+    "photo", "what colours cameras saw.", "what cameras saw; grey where none did",
+    "taichi_mrf.queries.colored:painted",
+)  # fmt: skip
 _OF_COLOR_IMAGES = FromPixels(
-    "color", 3, "taichi_mrf.inference.voxel_colors:ColorVisitor", "frozen_color", ("rg", "bw")
+    "color", 3, "taichi_mrf.inference.voxel_colors:ColorVisitor", "frozen_color", ("rg", "bw"), _PHOTO
 )
 
 LAYERS = {

@@ -2,16 +2,20 @@
 package does not know (support/label_layer.py) is counted by the posterior, and is exact under edits, in
 files, in windows, in chunks and for other times."""
 
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import colored_scene as scene
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from label_layer import CLASSES, ENTRY, LABELS
+from inputs_frames import Frames
+from label_layer import CLASSES, ENTRY, LABELS, PAGE
 from one_pixel import VOXEL, FineMap, cavities, look_along, spread
 from oracles import inference as reference
 from oracles.forward import Noise
@@ -19,15 +23,31 @@ from sliding_camera import CAMERA, WALL_M
 from window_walk import OUT, probes, unwindowed, windowed
 
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
+from taichi_mrf.datasets.derived import resampled
 from taichi_mrf.errors import ConfigError, KeyframeError, MapFileError
 from taichi_mrf.export.chunk_blocks import write_chunks
+from taichi_mrf.export.formats import export_map
+from taichi_mrf.export.options import ExportOptions
+from taichi_mrf.geometry.up import Z_UP
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.merging import frame_of
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.colored import shown_colors
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.voxels.layers import LAYERS
+from taichi_mrf.session.mapper import Mapper
+from taichi_mrf.session.shown_extras import BaselineOverlay, ShownColors
+from taichi_mrf.viewer.messages import pack_log_odds
+from taichi_mrf.viewer.scene import coloring
+from taichi_mrf.viewer.scene.coloring import COLORINGS, legend_html
+from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.viewer.scene.voxel_layer import look_of
+from taichi_mrf.viewer.scene.voxel_store import VoxelStore, facing
+from taichi_mrf.voxels.layers import COLORS, LAYERS
 
 pytestmark = pytest.mark.usefixtures("backend", "label_entry")
 
@@ -233,3 +253,107 @@ def test_wrong_images_are_refused() -> None:
             m.add_keyframe(depth, scene.pose(0.0), scene.CAMERA, images={name: wrong})
     with pytest.raises(ConfigError, match="pass no color or images"):
         LogOddsMap(scene.VOXEL).add_keyframe(depth, scene.pose(0.0), scene.CAMERA, images={LABELS: good})
+
+
+def test_frames_bring_it_also_thinned_out() -> None:
+    depth, _ = scene.view(0.0)
+    image = np.random.default_rng(5).integers(0, CLASSES + 1, scene.CAMERA.shape).astype(np.uint8)
+    frame = Frame(depth, scene.pose(0.0), scene.CAMERA, 3.0, "first", images={LABELS: image})
+    m = MRFMap(scene.VOXEL, scene.NOISE)
+    id = m.add(frame)
+    np.testing.assert_array_equal(m.keyframes[id].beside(LABELS), image)
+    assert frame_of(m.keyframes[id]).images.keys() == {LABELS}
+    LogOddsMap(scene.VOXEL).add(frame)  # has no such layers, as it has no colours
+    thin = resampled(Frames("one", scene.CAMERA, frames=[frame]), (), 3).read(0)
+    np.testing.assert_array_equal(thin.images[LABELS], image[1::3, 1::3])
+    turned = resampled(Frames("one", scene.CAMERA, frames=[frame]), (), 1, "upside-down").read(0)
+    np.testing.assert_array_equal(turned.images[LABELS], image[::-1, ::-1])
+
+
+def test_exports_have_it_under_its_name(tmp_path: Path) -> None:
+    m = build([0, 1, 2])
+    for name in ("map.ply", "map.npz", "map.zarr", "cells.ply"):
+        export_map(m, tmp_path / name, ExportOptions(cells=name.startswith("cells")))
+    centres, _ = m.voxels()
+    wanted = m.pixel_layers[LABELS].at(centres)
+    assert (wanted[:, [2, 6]].sum(axis=0) > 0).all()
+    for name in ("map.ply", "cells.ply"):
+        np.testing.assert_array_equal(_points(tmp_path / name)[: len(wanted), 3:], wanted)
+    assert f"comment {LABELS} is {ENTRY.about}\n".encode() in (tmp_path / "map.ply").read_bytes()
+    with np.load(tmp_path / "map.npz") as arrays:
+        middle = (arrays["voxels"] + 0.5) * arrays["voxel_size"]
+        np.testing.assert_array_equal(arrays[LABELS], m.pixel_layers[LABELS].at(middle))
+        assert arrays[LABELS].shape == (len(middle), CLASSES)
+        assert arrays[LABELS].any()
+    stored = ChunkedMap.open(tmp_path / "map.zarr")
+    np.testing.assert_array_equal(stored.pixel_layers[LABELS].at(centres), wanted)
+    np.testing.assert_array_equal(stored.colors(centres), m.colors(centres))
+    export_map(take_part(stored), tmp_path / "part.ply")
+    in_order = (np.unique(_points(tmp_path / name), axis=0) for name in ("part.ply", "map.ply"))
+    np.testing.assert_array_equal(*in_order)
+
+
+def _points(path: Path) -> np.ndarray:
+    """Position and labels of each point of a file, (n, 3 + 8), as another library reads it."""
+    with open(path, "rb") as file:
+        told = trimesh.exchange.ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
+    names = [*"xyz", *(f"{LABELS}_{class_}" for class_ in range(CLASSES))]
+    return np.stack([np.asarray(told[each], np.float64).ravel() for each in names], axis=1)
+
+
+def test_exports_without_values_do_not_name_it(tmp_path: Path) -> None:
+    m = scene.build([0, 1])
+    for name in ("map.ply", "map.npz"):
+        export_map(m, tmp_path / f"with_{name}")
+        del LAYERS[LABELS]
+        export_map(m, tmp_path / f"without_{name}")
+        LAYERS[LABELS] = ENTRY
+        assert (tmp_path / f"with_{name}").read_bytes() == (tmp_path / f"without_{name}").read_bytes()
+
+
+def test_the_page_colours_voxels_by_it_with_a_legend(monkeypatch: pytest.MonkeyPatch) -> None:
+    by_the_table = runpy.run_path(coloring.__file__)["COLORINGS"]
+    assert by_the_table.keys() - COLORINGS.keys() == {PAGE.coloring}
+    monkeypatch.setitem(COLORINGS, PAGE.coloring, by_the_table[PAGE.coloring])
+    m, store = build([0, 1, 2]), VoxelStore()
+    slots = m.view.pool.in_use
+    store.put(m.view.pool.bricks[slots], log_odds=pack_log_odds(m.view.pool.read("belief", slots)))
+    find = ShownColors(cast(Mapper, SimpleNamespace(map=m)))
+    sent = find.changes()
+    assert {update.layer for update in sent} == {COLORS, LABELS}
+    assert not find.changes()
+    for update in sent:
+        store.put(update.bricks, **{update.layer: update.colors})
+    seen = {}
+    for name in ("photo", PAGE.coloring):
+        look = look_of(ViewOptions(color_by=name, shade=False), store, Z_UP, scene.VOXEL)
+        for key in store.chunks:
+            shown = store.shown(key, 0.0, None)
+            centres_m = (shown.cells + np.array(key) * 64 + 0.5) * scene.VOXEL
+            colors = look.paint(shown, shown.cells, scene.VOXEL, np.zeros(3), facing(shown.cells))
+            seen |= {(name, *at): rgb for at, rgb in zip(centres_m.tolist(), colors.tolist(), strict=True)}
+        legend = legend_html(look.scale)
+        assert ("class 7" in legend and PAGE.caption in legend) == (name == PAGE.coloring)
+    points = np.array([at[1:] for at in seen if at[0] == PAGE.coloring])
+    counts, photo = m.pixel_layers[LABELS].at(points), shown_colors(m, points)
+    told = counts.any(axis=1)
+    assert told.sum() > 100
+    for point, count, rgb in zip(points, counts, photo, strict=True):
+        class_color = [30 * (count.argmax() + 1), 255 - 30 * (count.argmax() + 1), 40]
+        assert seen[(PAGE.coloring, *point)] == (class_color if count.any() else [128] * 3)
+        assert seen[("photo", *point)] == rgb.tolist()
+
+
+def test_a_live_run_edits_keyframes_with_it_and_its_baseline_does_without() -> None:
+    m, depth = MRFMap(scene.VOXEL, scene.NOISE), scene.view(0.0)[0]
+    image = np.full(scene.CAMERA.shape, 3, np.uint8)
+    frame = Frame(depth, scene.pose(0.0), scene.CAMERA, 3.0, "first", images={LABELS: image})
+    mapper, id = Mapper(m), m.add(frame)
+    entry = mapper.enter(Added(frame, id, m.keyframes[id].rays))
+    baseline = BaselineOverlay(m.config, m.noise)
+    assert baseline.catch_up(mapper, lambda progress: True)
+    assert len(baseline.map.keyframes) == 1
+    mapper.switch(entry.id, on=False)
+    mapper.switch(entry.id, on=True)
+    (again,) = m.keyframes.values()
+    np.testing.assert_array_equal(again.beside(LABELS), image)

@@ -21,6 +21,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.layout import VOXELS
 
 # Written out, and not imported: these tests hold the value.
@@ -171,13 +172,13 @@ def test_a_chunk_that_leaves_the_window_holds_no_colours_of_bricks_that_are_gone
 
 def test_recent_colours_are_not_those_of_a_brick_that_had_the_slot_before() -> None:
     m = with_a_brick_gone()
-    seen = m.recent_colors().reshape(-1, VOXELS, 4).any(axis=(1, 2))
+    seen = m.pixel_layers[COLORS].follow().reshape(-1, VOXELS, 4).any(axis=(1, 2))
     slot = int(np.flatnonzero(seen)[0])
     m._registry._release(np.array([slot], np.int32))  # as when it leaves a window
     other = m._registry.create(np.array([[40, 40, 40]], np.int32))
     m.view.pool.owners[other] = 1
     assert other.tolist() == [slot]
-    assert not m.recent_colors().reshape(-1, VOXELS, 4)[slot].any()
+    assert not m.pixel_layers[COLORS].follow().reshape(-1, VOXELS, 4)[slot].any()
 
 
 def test_nothing_smears_onto_what_stands_behind() -> None:
@@ -240,15 +241,15 @@ def test_files_keep_colours(tmp_path: Path) -> None:
 
 def test_new_keyframes_alone_bring_recent_colours_up_to_date() -> None:
     m = scene.build([0])
-    first = m.recent_colors()
+    first = m.pixel_layers[COLORS].follow()
     id = scene.add(m, 3)
     m.infer(keyframes=[id])
-    both = m.recent_colors()
+    both = m.pixel_layers[COLORS].follow()
     assert (both[: len(first)] != first).any()
     m.remove_keyframe(id)
     m.infer()
     np.testing.assert_array_equal(
-        m.recent_colors(), m.colors_in(np.arange(m.view.pool.capacity)).reshape(-1, 4)
+        m.pixel_layers[COLORS].follow(), m.colors_in(np.arange(m.view.pool.capacity)).reshape(-1, 4)
     )
 
 

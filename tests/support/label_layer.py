@@ -1,6 +1,6 @@
 """A layer of voxels that the package does not have: a histogram of eight classes, of an image beside depth.
 
-It is all that a new layer needs: an entry for the table (``ENTRY``) and a visitor.
+It is all that a new layer needs: an entry for the table (``ENTRY``), a visitor, and colours for the page.
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,30 @@ from taichi_mrf.inference.ray_list import block_of
 from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layers import FromPixels, Layer
+from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import FromPixels, Layer, OnPage
 
 CLASSES = 8
+PALETTE = np.array([[30 * n, 255 - 30 * n, 40] for n in range(1, CLASSES + 1)], np.uint8)
 STEPS = 8.0
 """Steps of a class's sum for each pixel."""
 
 LABELS = "labels"
+PAGE = OnPage(
+    "what it is", "which class a voxel has.", "the likeliest class", "label_layer:painted",
+    tuple((f"class {n}", tuple(PALETTE[n - 1].tolist())) for n in range(1, CLASSES + 1)),
+)  # fmt: skip
 ENTRY = Layer(
     "uint16", CLASSES, 0, "eighths of pixels of each class",
-    FromPixels(LABELS, 1, "label_layer:LabelVisitor", "frozen_labels", ("c01", "c23", "c45", "c67")),
+    FromPixels(LABELS, 1, "label_layer:LabelVisitor", "frozen_labels", ("c01", "c23", "c45", "c67"), PAGE),
 )  # fmt: skip
 
 Counts = ti.types.vector(CLASSES, ti.f32)
+
+
+def painted(values: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """The colours of the likeliest classes."""
+    return np.where(values.any(axis=-1)[..., None], PALETTE[values.argmax(axis=-1)], np.uint8(NO_COLOR))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,9 +14,11 @@ from handled_page import HandledPage
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.live.panel import Clicked
+from taichi_mrf.viewer.scene import coloring
 from taichi_mrf.viewer.scene.coloring import COLORINGS, Coloring, Measure, legend_html
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
 from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.voxels.layers import LAYERS, FromPixels, Layer, OnPage
 
 VOXEL = 0.1
 HELLO = m.Hello(
@@ -39,6 +42,13 @@ VIEW = m.SurfaceView(
     photo=False,
 )
 CHUNK = (0, -1, 0)
+BRICK = m.Bricks(
+    "map",
+    np.zeros((1, 3), np.int32),
+    np.full((1, 512), 900, np.int16),
+    np.ones((1, 512), np.uint8),
+    np.zeros((0, 3), np.int32),
+)
 GREYS = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
 
 
@@ -61,8 +71,7 @@ class SurfacePage(HandledPage):
 
     def __init__(self) -> None:
         super().__init__(Page, HELLO)
-        brick, packed = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
-        self.take(m.Bricks("map", brick, packed, np.ones((1, 512), np.uint8), brick[:0]))
+        self.take(BRICK)
 
     def draw(self, **options: object) -> str:
         """Draw with these options; the line of counts."""
@@ -269,6 +278,35 @@ def test_the_surface_has_the_colours_of_the_voxels_behind_it(drawn: SurfacePage)
     drawn.page.map._sent_at = 0.0
     drawn.page._flush()
     assert np.abs(drawn.mesh()[2][0].astype(int) - (240, 110, 40)).max() <= 2
+
+
+def test_a_layer_that_pixels_feed_is_a_colouring_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    look = OnPage("how warm", "how warm it is.", "warmth", "absent:absent", (("an oven", (200, 0, 0)),))
+    made, name = FromPixels("thermal", 1, "absent:Absent", "frozen_heat", ("h",), look), look.coloring
+    monkeypatch.setitem(LAYERS, "heat", Layer("uint8", 1, 0, "how warm", made))
+    monkeypatch.setitem(COLORINGS, name, runpy.run_path(coloring.__file__)["COLORINGS"][name])
+    running = SurfacePage()
+    try:
+        widget = running.page.panel.view_options.handles["color_by"]
+        assert name not in widget.options
+        running.take(replace(HELLO, layers=("heat",), has_colors=False))
+        assert name in widget.options
+        assert "photo" not in widget.options
+        running.take(replace(HELLO, layers=("heat",)), BRICK)
+        assert "photo" in widget.options
+        widget.value = name
+        running.draw(color_by=name, draw_as="voxels", shade=False)
+        assert running.asked[-1] == m.Watch(False, None, False, colors=True)
+        heat, photo = (np.full((1, 512, 3), level, np.uint8) for level in (200, 50))
+        running.take(m.BrickColors((0, 0, 0), BRICK.bricks, heat, "heat"))
+        running.take(m.BrickColors((0, 0, 0), BRICK.bricks, photo))
+        for each, level in ((name, 200), ("photo", 50)):
+            running.draw(color_by=each, draw_as="voxels", shade=False)
+            (sent,) = running.page.map.layers["map"]._sent.values()
+            assert (sent.colors == level).all()
+            assert ("an oven" in running.page.panel._legend.content) == (each == name)
+    finally:
+        running.server.stop()
 
 
 def test_an_entry_of_the_table_is_a_colouring_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:

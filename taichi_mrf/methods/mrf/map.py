@@ -35,7 +35,6 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.distance_field import DistanceField
-from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -353,11 +352,6 @@ class MRFMap(BrickMap):
         """The layers of voxels that pixels feed, by name (voxels/layers.py). What a pixel says is shared
         among the voxels on its ray by the probability that it saw them, as of the last :meth:`infer`."""
         return MappingProxyType(self._parts.layers)
-
-    def recent_colors(self) -> NDArray[np.uint8]:
-        """Colours (slots * 512, 4) while keyframes are added, at the cost of the new ones alone: colours by
-        earlier keyframes are not recomputed (PixelLayer.follow)."""
-        return self._parts.layers[COLORS].follow()
 
     @property
     def keeps_surface(self) -> bool:

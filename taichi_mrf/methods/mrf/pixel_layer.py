@@ -16,7 +16,7 @@ from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.inference.voxel_share import VoxelShare
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.system.later import later
-from taichi_mrf.voxels.layers import LAYERS, BrickValues, pixel_layers
+from taichi_mrf.voxels.layers import LAYERS, BrickValues, imported, pixel_layers
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -129,7 +129,7 @@ class PixelLayer:
 
     def frozen_values(self, chunks: NDArray[np.int32]) -> BrickValues:
         """The layer that frozen keyframes gave to the voxels of some chunks, (n, 3)."""
-        return self.frozen.in_chunks(chunks).values(self._made.load_visitor().values)
+        return self.frozen.in_chunks(chunks).values(imported(self._made.visitor).values)
 
     def release(self, chunks: NDArray[np.int32]) -> None:
         """Remove what frozen keyframes gave to the voxels of some chunks, (n, 3)."""
@@ -168,7 +168,7 @@ class PixelLayer:
         return np.zeros((bricks, VOXELS, *self._layer.shape), self._layer.dtype)
 
     def _of_sums(self, sums: "pixel_pass.VoxelSums") -> NDArray:
-        return np.asarray(self._made.load_visitor().values(sums.sums))
+        return np.asarray(imported(self._made.visitor).values(sums.sums))
 
     def _known(self) -> NDArray:
         """Values (capacity * 512, ...) by slot, computed if the map has changed."""

@@ -2,11 +2,11 @@
 them.
 
 A colouring is one entry of :data:`COLORINGS`: the page offers it where the map has its data, makes its legend
-from the numbers that are there, and shows its help.
+from the numbers that are there, and shows its help. Layers that pixels feed bring theirs (voxels/layers.py).
 """
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import NO_COLOR
+from taichi_mrf.voxels.layers import COLORS, OnPage, pixel_layers
 
 Floats = NDArray[np.floating]
 Ends = tuple[float, float]
@@ -82,7 +83,7 @@ class Measure:
 
     ``ends`` are made from some of the numbers, and from the lowest and the highest height of the map.
     ``logarithmic``: equal ratios are equal steps. ``marks`` are the legend's words between two ends, at even
-    distances, in place of the numbers.
+    distances, in place of the numbers. ``key`` are colours by what they mean, where colours are given.
     """
 
     label: str
@@ -91,6 +92,7 @@ class Measure:
     ends: Callable[[Floats, Ends], Ends] = spread
     logarithmic: bool = False
     marks: Callable[[float, float], tuple[str, ...]] = lambda low, high: ()
+    key: tuple[tuple[str, tuple[int, int, int]], ...] = ()
 
     def scale(self, some: NDArray, heights_m: Ends) -> "Scale":
         """The scale on which ``some`` of the numbers lie, in a map between two heights."""
@@ -133,12 +135,13 @@ class Scale:
 class Coloring:
     """One entry of the table: the ``help`` that the page shows; what the colours say of ``voxels``, and of
     vertices of the ``surface`` (None: each has the colour of the voxel behind it); and the data that voxels
-    then need."""
+    then need, of a ``layer`` if it is pixels that feed it."""
 
     help: str
     voxels: Measure
     surface: Measure | None = None
     needs: Need = ""
+    layer: str = ""
 
 
 def _chances(log_odds: NDArray[np.int16]) -> Floats:
@@ -168,8 +171,15 @@ def _chance_marks(low: float, high: float) -> tuple[str, ...]:
     return tuple(names[2:]) if low == 0 else (names[0], "1 in 2", names[-1])
 
 
-def _seen_colors(known: Any, heights_m: Floats) -> NDArray[np.uint8]:
-    return np.full((len(heights_m), 3), NO_COLOR, np.uint8) if known.colors is None else known.colors
+def _of_pixels(layer: str, page: OnPage) -> Coloring:
+    """The colouring of a layer that pixels feed. Vertices have colours alone of their own."""
+
+    def painted(known: Any, heights_m: Floats) -> NDArray[np.uint8]:
+        found = known.colors if layer == COLORS else known.layers.get(layer)
+        return np.full((len(heights_m), 3), NO_COLOR, np.uint8) if found is None else found
+
+    measure = Measure(page.caption, painted, key=page.key)
+    return Coloring(page.help, measure, measure if layer == COLORS else None, "colors", layer)
 
 
 _HEIGHT_LABEL = "height above the lowest surface (m)"
@@ -180,7 +190,6 @@ _HEIGHT = Measure(
     ends=lambda numbers, heights_m: heights_m,
     marks=lambda low, high: ("0", _HEIGHT_LABEL, f"{high - low:.3g}"),
 )
-_PHOTO = Measure("what cameras saw; grey where none did", _seen_colors)
 _PLAIN = Measure("", lambda known, heights_m: np.full((len(heights_m), 3), NO_COLOR, np.uint8))
 
 COLORINGS: dict[str, Coloring] = {
@@ -207,7 +216,7 @@ COLORINGS: dict[str, Coloring] = {
             logarithmic=True,
         ),
     ),
-    "photo": Coloring("what colours cameras saw.", _PHOTO, _PHOTO, needs="colors"),
+    **{made.page.coloring: _of_pixels(name, made.page) for name, made in pixel_layers().items()},
     "keyframes that see it": Coloring(
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
@@ -238,7 +247,8 @@ def legend_html(scale: Scale) -> str:
     """The scale as a strip with numbers, for the page."""
     label = scale.measure.label
     if not len(scale.colors):
-        return f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
+        said = f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
+        return said + _swatches(dict(scale.measure.key))
     strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
     ends = f"{scale.low:.3g}", label, f"{scale.high:.3g}"
     named = scale.measure.marks(scale.low, scale.high) or ends
@@ -258,13 +268,16 @@ def key_html(space: bool, changes: bool) -> str:
     named = dict(SPACE_COLORS) if space else {}
     if changes:
         named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
+    return _swatches(named, " · unknown: nothing" if space else "")
+
+
+def _swatches(named: Mapping[str, tuple[int, int, int]], beside: str = "") -> str:
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
     spans = "".join(
         f'<div style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
-    unknown = " · unknown: nothing" if space else ""
-    return f'<div style="font-size:0.85em">{spans}{unknown}</div>' if named else ""
+    return f'<div style="font-size:0.85em">{spans}{beside}</div>' if named else ""
 
 
 def probabilities() -> NDArray[np.float64]:

@@ -159,7 +159,7 @@ class MapScene:
 
     def paint(self, colors: BrickColors) -> None:
         """Take in colours of the map's bricks; :meth:`flush` draws them."""
-        self.layers["map"].changed |= self.store.put(colors.bricks, colors=colors.colors)
+        self.layers["map"].changed |= self.store.put(colors.bricks, **{colors.layer: colors.colors})
         self._news_at = time.monotonic()
 
     def show_measured(self, measured: MeasuredPoints, T_world_camera: Pose) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from taichi_mrf.config.method import Range
 from taichi_mrf.viewer.messages import Hello
 from taichi_mrf.viewer.scene.coloring import COLORINGS
+from taichi_mrf.voxels.layers import COLORS
 
 Draw = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
@@ -94,8 +95,9 @@ OF_LAYER = {
 
 def colorings_of(hello: Hello) -> tuple[str, ...]:
     """The colourings that a map has the data for."""
-    has = {"": True, "counts": hello.counts_keyframes, "colors": hello.has_colors}
-    return tuple(name for name, coloring in COLORINGS.items() if has[coloring.needs])
+    layers = ("", *hello.layers, *[COLORS] * hello.has_colors)
+    fit = {name: c for name, c in COLORINGS.items() if c.layer in layers}
+    return tuple(name for name, c in fit.items() if c.needs != "counts" or hello.counts_keyframes)
 
 
 def drawings_of(hello: Hello) -> tuple[Draw, ...]:

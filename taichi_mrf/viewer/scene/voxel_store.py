@@ -4,7 +4,8 @@ A chunk of 64^3 voxels is the unit that is sent to browsers. It holds its bricks
 show, without the mapping process.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ _LAYERS = {
     COLORS: Layer("uint8", 3, NO_COLOR, "red, green, blue that cameras saw"),
     "earlier": Layer("int16", 1, -32768, "log-odds before today's first keyframe, in an earlier map"),
 }
-"""The layers of a map as they are sent to the page."""
+"""The layers of a map as they are sent to the page; others that pixels feed are sent in colours."""
 
 _CODES = np.stack(np.unravel_index(np.arange(CHUNK**3), (CHUNK,) * 3), axis=1).astype(np.uint8)
 _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
@@ -40,13 +41,27 @@ _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
 class Shown:
     """Voxels of one chunk: ``cells`` (n, 3) uint8 in 0..63, ``log_odds`` (n,) int16 in LOG_ODDS_STEP,
     ``seen`` (n,) uint8 keyframes, ``colors`` (n, 3) RGB that cameras saw, None if the chunk has none;
-    ``earlier`` (n,) int16 log-odds of the map that a recording has joined, None if it joined none."""
+    ``earlier`` (n,) int16 log-odds of the map that a recording has joined, None if it joined none;
+    ``layers`` colours (n, 3) of other layers that pixels feed."""
 
     cells: NDArray[np.uint8]
     log_odds: NDArray[np.int16]
     seen: NDArray[np.uint8]
     colors: NDArray[np.uint8] | None = None
     earlier: NDArray[np.int16] | None = None
+    layers: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, cells: NDArray[np.uint8], values: Mapping[str, NDArray]) -> "Shown":
+        """Voxels with the values of layers by their names."""
+        own: Any = {name: each for name, each in values.items() if name in _LAYERS}
+        return cls(cells, **own, layers={name: each for name, each in values.items() if name not in _LAYERS})
+
+    @property
+    def values(self) -> dict[str, NDArray]:
+        """The values of all layers that are known, by their names."""
+        own = {name: getattr(self, name) for name in _LAYERS}
+        return {name: each for name, each in {**own, **self.layers}.items() if each is not None}
 
     @property
     def is_earlier(self) -> NDArray[np.bool_]:
@@ -55,8 +70,7 @@ class Shown:
 
     def __getitem__(self, which: slice) -> "Shown":
         """Some of the voxels."""
-        kept: Any = {name: each if each is None else each[which] for name, each in vars(self).items()}
-        return Shown(**kept)
+        return Shown.of(self.cells[which], {name: each[which] for name, each in self.values.items()})
 
 
 @dataclass(frozen=True)
@@ -150,7 +164,7 @@ class Chunk:
         if cut is not None:
             kept = cut.keeps(cells[:, cut.axis] + 0.5)
             voxels, cells = voxels[kept], cells[kept]
-        return Shown(cells, **{name: values[voxels] for name, values in every.items()})
+        return Shown.of(cells, {name: values[voxels] for name, values in every.items()})
 
     def voxels(self, cells: NDArray[np.integer]) -> Shown:
         """The voxels with coordinates (n, 3), 0 to 63; those that are not here have missing values."""
@@ -160,7 +174,7 @@ class Chunk:
         for name, values in self.values.items():
             found[name] = _filled(name, len(cells))
             found[name][here] = values[row[here], number[here]]
-        return Shown(cells.astype(np.uint8), **found)
+        return Shown.of(cells.astype(np.uint8), found)
 
     def sample(self, log_odds: float) -> Shown:
         """Some voxels of at least these log-odds, from all over the chunk; the same in whatever order its
@@ -261,17 +275,16 @@ class VoxelStore:
                 self._samples[key] = log_odds, self.chunks[key].sample(log_odds)
         found = [self._samples[key][1] for key in keys] or [Chunk().at_least(log_odds)]
         values = {}
-        for name in _LAYERS:
-            each = [getattr(shown, name) for shown in found]
-            if any(part is not None for part in each):
-                filled = (_filled(name, len(shown.cells)) for shown in found)
-                values[name] = np.concatenate(
-                    [one if part is None else part for part, one in zip(each, filled, strict=True)]
-                )
+        known = [shown.values for shown in found]
+        for name in set().union(*known):
+            filled = (_filled(name, len(shown.cells)) for shown in found)
+            values[name] = np.concatenate(
+                [each.get(name, one) for each, one in zip(known, filled, strict=True)]
+            )
         corners = np.array(keys, np.float64).reshape(-1, 3) * CHUNK_VOXELS
         many = [len(shown.cells) for shown in found]
         cells = np.concatenate([shown.cells for shown in found])
-        return Shown(cells, **values), cells + 0.5 + (np.repeat(corners, many, axis=0) if keys else 0.0)
+        return Shown.of(cells, values), cells + 0.5 + (np.repeat(corners, many, axis=0) if keys else 0.0)
 
     def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
         """The voxels of a chunk with at least these log-odds that are not cut away; none if there is no such
@@ -295,7 +308,7 @@ def _missing(name: str, bricks: int) -> NDArray:
 
 
 def _filled(name: str, *shape: int) -> NDArray:
-    layer = _LAYERS[name]
+    layer = _LAYERS.get(name, _LAYERS[COLORS])
     return np.full((*shape, *layer.shape), layer.missing, layer.dtype)
 
 
