@@ -156,8 +156,8 @@ def kernels(options: Options) -> dict[str, Any]:
 def wall(options: Options) -> dict[str, Any]:
     """Wall time of a keyframe with three sweeps, and of full inference at the finest voxel size."""
     from benchmarks.speed.profile import count_launches
-    from taichi_mrf.benchmark.keyframe_cost import Seconds, live_stages, timed, warm_up
     from taichi_mrf.config.schema import Config
+    from taichi_mrf.evaluation.keyframe_cost import Seconds, live_stages, timed, warm_up
     from taichi_mrf.methods.mrf.map import MRFMap
 
     device = _start(options)
@@ -197,8 +197,8 @@ def distances(options: Options) -> dict[str, Any]:
     """Distances to obstacles at 10,000 points, and their update after a new keyframe."""
     import numpy as np
 
-    from taichi_mrf.benchmark.keyframe_cost import Seconds, timed
     from taichi_mrf.config.schema import Config
+    from taichi_mrf.evaluation.keyframe_cost import Seconds, timed
     from taichi_mrf.methods.mrf.map import MRFMap
     from taichi_mrf.queries.distance import DistanceField
 
@@ -226,7 +226,7 @@ def distances(options: Options) -> dict[str, Any]:
 
 def octomap(options: Options) -> dict[str, Any]:
     """OctoMap on one CPU core, a ray for each pixel, at the finest voxel size."""
-    from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
+    from taichi_mrf.evaluation.bench import octomap_available, octomap_inserter
 
     if not octomap_available():
         return {"missing": "pip install 'taichi-mrf[bench]' brings OctoMap"}

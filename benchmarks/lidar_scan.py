@@ -15,8 +15,8 @@ import tyro
 from numpy.typing import NDArray
 
 from taichi_mrf import Frame, SphericalCamera
-from taichi_mrf.benchmark.bench import bench_mapping, octomap_available
 from taichi_mrf.config.schema import Arch, Config, SensorConfig
+from taichi_mrf.evaluation.bench import bench_mapping, octomap_available
 from taichi_mrf.system import runtime
 
 HALF_M = np.array([12.0, 8.0, 2.5])

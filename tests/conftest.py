@@ -35,7 +35,7 @@ SERVERS = {
 }
 """Libraries and their functions that start a process or a server."""
 
-SLOW = (HERE / "doctor", HERE)
+SLOW = (HERE / "datasets" / "doctor", HERE)
 """Folders whose tests take minutes although they are few."""
 
 FOR_EVERY_BACKEND = ("backends", "compilers", "smoke")

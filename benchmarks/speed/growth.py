@@ -14,8 +14,8 @@ import numpy as np
 from rich.table import Table
 
 from taichi_mrf import Config, Frame, MRFMap
-from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, warm_up
 from taichi_mrf.cli.bench import BenchRun, Measured
+from taichi_mrf.evaluation.keyframe_cost import Seconds, add_timed, warm_up
 from taichi_mrf.evaluation.pictures.figures import new_figure
 
 if TYPE_CHECKING:

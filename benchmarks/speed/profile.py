@@ -32,10 +32,10 @@ from rich.table import Table
 import taichi_mrf
 from benchmarks.speed.bandwidth import Bandwidth, copy_bandwidth
 from taichi_mrf import Config, Frame, MRFMap
-from taichi_mrf.benchmark.bench import STEADY_FRAMES
-from taichi_mrf.benchmark.bench_pictures import STAGE_COLORS, STAGE_NAMES, TARGET_COLOR, legend_below
-from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.cli.bench import BenchRun, Measured
+from taichi_mrf.evaluation.bench import STEADY_FRAMES
+from taichi_mrf.evaluation.bench_pictures import STAGE_COLORS, STAGE_NAMES, TARGET_COLOR, legend_below
+from taichi_mrf.evaluation.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.inference.sweep import TRACE_BYTES
 from taichi_mrf.kernels import quick_launch, quick_start

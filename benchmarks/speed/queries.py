@@ -31,8 +31,8 @@ from taichi_mrf import (
     export_map,
     read_box,
 )
-from taichi_mrf.benchmark.keyframe_cost import Seconds, timed
 from taichi_mrf.cli.bench import BenchRun, Measured, size_columns
+from taichi_mrf.evaluation.keyframe_cost import Seconds, timed
 from taichi_mrf.system.libraries import library
 
 POINTS = 1_000_000

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from taichi_mrf.benchmark.bench import BenchRow, bench_mapping, octomap_available
-from taichi_mrf.benchmark.bench_pictures import draw_stages, write_figure
-from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.bench import BenchRow, bench_mapping, octomap_available
+from taichi_mrf.evaluation.bench_pictures import draw_stages, write_figure
+from taichi_mrf.evaluation.keyframe_cost import Seconds
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text

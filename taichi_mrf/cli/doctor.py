@@ -8,10 +8,10 @@ import numpy as np
 
 from taichi_mrf.cli.options.doctor import Doctor
 from taichi_mrf.cli.shared.terminal import READ_WRONG, Terminal
+from taichi_mrf.datasets.doctor.diagnosis import Diagnosis
+from taichi_mrf.datasets.doctor.picture import overlap
+from taichi_mrf.datasets.doctor.remedy import Remedy, remedy
 from taichi_mrf.datasets.registry import is_rendered
-from taichi_mrf.doctor.diagnosis import Diagnosis
-from taichi_mrf.doctor.picture import overlap
-from taichi_mrf.doctor.remedy import Remedy, remedy
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import atomic_path

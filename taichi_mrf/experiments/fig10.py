@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taichi_mrf import Frame
-from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.bench import octomap_available, octomap_inserter
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Table, write_table
 from taichi_mrf.experiments.contenders import mrf

@@ -16,8 +16,8 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
+from taichi_mrf.datasets.doctor.diagnosis import mistakes
 from taichi_mrf.datasets.recorded_noise import some_depths
-from taichi_mrf.doctor.diagnosis import mistakes
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.free_space import MOST_FRAMES, calibrate_free, spread_frames
 from taichi_mrf.evaluation.held_out import HeldOutCheck, Render, check_held_out

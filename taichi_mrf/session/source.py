@@ -11,13 +11,13 @@ from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.doctor.diagnosis import doubtful_at_a_glance, mistakes
 from taichi_mrf.datasets.entries import holds_frames
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import format_name, recognise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import note_unused_color
-from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance, mistakes
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.mapping.onto import Placed, freeze_all, placed_in

@@ -11,8 +11,8 @@ import small_room
 from benchmarks.speed import queries
 from benchmarks.speed.__main__ import main
 from taichi_mrf import ExportOptions, cast_rays, export_map
-from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.config.schema import Config
+from taichi_mrf.evaluation.keyframe_cost import Seconds
 
 NAMES = {"occupancy", "state", "distance", "distance and gradient", "balls", "rays", "rays of an image"}
 CALLS = {"states", "distances", "rays", "rays that the unknown stops"}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from console import COARSE, taichi_mrf
 
+from taichi_mrf.cluster.submaps.rounds import _check
 from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig, VolumeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
@@ -15,7 +16,6 @@ from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.queries.points import UNKNOWN
 from taichi_mrf.session.source import open_source
-from taichi_mrf.submaps.rounds import _check
 
 pytest.importorskip("zarr", reason="a window needs the extra store")
 pytestmark = pytest.mark.usefixtures("one_backend")

@@ -11,6 +11,8 @@ from datasets_recordings import Content, arrays, write_npz, write_stray
 from point_clouds import Walk, write_scans
 from refusals import bad_frame, refused
 
+from taichi_mrf.cluster.submaps.plan import SourceFrames
+from taichi_mrf.cluster.submaps.survey import find_keyframes
 from taichi_mrf.config.schema import Config, KeyframeConfig, SensorConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
@@ -21,8 +23,6 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.submaps.plan import SourceFrames
-from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.system import runtime
 
 TEXT = """

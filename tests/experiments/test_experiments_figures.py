@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from small_scenes import COFFIN_VIEWS, HOUSE_VIEWS, experiment
 
-from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
+from taichi_mrf.evaluation.bench import octomap_available
 from taichi_mrf.experiments.fig7 import COLORS, NAMES, beside_an_edge, run_fig7
 from taichi_mrf.experiments.fig8 import run_fig8, run_fig9
 from taichi_mrf.experiments.fig10 import FULL_AT, run_fig10

@@ -8,8 +8,8 @@ import pytest
 from small_scenes import CAMERA
 
 from taichi_mrf import PinholeCamera, PolynomialNoise
-from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.evaluation.bench import octomap_available
 from taichi_mrf.experiments.peers import cases, our_maps, run
 from taichi_mrf.experiments.peers.cases import (
     FREE_A_PIXEL,

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_mrf.cluster.submaps.round_files import RoundResult, SubmapReport, read_layer, write_round
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, put_chunks
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.submaps.round_files import RoundResult, SubmapReport, read_layer, write_round
 from taichi_mrf.voxels.layers import LAYERS, LOG_ODDS, BrickValues, Chunk, Layer, Layers
 
 pytest.importorskip("zarr", reason="maps in chunks need the extra store")

@@ -10,6 +10,8 @@ from benchmarks.lab.submaps.costs import MeasuredCost, costs_table
 from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf import ChunkedMap, Config
 from taichi_mrf.cluster.local import LocalProcesses
+from taichi_mrf.cluster.submaps.plan import Job, Plan, SourceFrames, Submap
+from taichi_mrf.cluster.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.corridor import NAME, floor_area_m2
@@ -20,8 +22,6 @@ from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.submaps.plan import Job, Plan, SourceFrames, Submap
-from taichi_mrf.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 FRAMES, ROOMS, ROUNDS, JOBS = 520, 12, 2, 2

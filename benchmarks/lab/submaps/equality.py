@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import UNKNOWN, ChunkedMap
+from taichi_mrf.cluster.submaps.round_files import SubmapReport
+from taichi_mrf.cluster.submaps.task import SubmapTask, infer_submap
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.known_bricks import BrickReader, known_bricks
 from taichi_mrf.queries.points import probability
-from taichi_mrf.submaps.round_files import SubmapReport
-from taichi_mrf.submaps.task import SubmapTask, infer_submap
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 
 NEAR = 0.02

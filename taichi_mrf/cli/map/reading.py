@@ -9,10 +9,10 @@ from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.doctor.diagnosis import doubtful_at_a_glance
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
 from taichi_mrf.datasets.summary import note_unused_color
-from taichi_mrf.doctor.diagnosis import doubtful_at_a_glance
 from taichi_mrf.errors import ReadWrongError
 from taichi_mrf.mapping.onto import freeze_all, placed_in
 from taichi_mrf.mapping.tracking import wants_color

@@ -10,6 +10,9 @@ from taichi_mrf.cli.shared.print_table import print_facts
 from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.cluster.choose import open_runner
+from taichi_mrf.cluster.submaps.picture import write_submap_picture
+from taichi_mrf.cluster.submaps.plan import SourceFrames
+from taichi_mrf.cluster.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.registry import absolute_source
@@ -17,9 +20,6 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
-from taichi_mrf.submaps.picture import write_submap_picture
-from taichi_mrf.submaps.plan import SourceFrames
-from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import VOXELS

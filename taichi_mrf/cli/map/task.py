@@ -12,10 +12,10 @@ from taichi_mrf.cli.options.shared import NoiseFlags
 from taichi_mrf.config.schema import Config, load, with_absolute_tables
 from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.doctor.remedy import remedy
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.registry import is_rendered
-from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.mapping.onto import parameters_onto

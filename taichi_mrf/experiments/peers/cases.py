@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import PolynomialNoise
-from taichi_mrf.benchmark.keyframe_cost import timed
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
+from taichi_mrf.evaluation.keyframe_cost import timed
 from taichi_mrf.evaluation.occupancy_scores import score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import occupancy_truth
 from taichi_mrf.evaluation.surface_scores import SurfaceTruth, surface_truth

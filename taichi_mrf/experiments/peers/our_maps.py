@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import FREE, OCCUPIED, LogOddsMap, MRFMap, VisibilityMap, WavemapMap
-from taichi_mrf.benchmark.keyframe_cost import timed
 from taichi_mrf.evaluation.accuracy import JudgedView
+from taichi_mrf.evaluation.keyframe_cost import timed
 from taichi_mrf.experiments.contenders import BOTH
 from taichi_mrf.experiments.judging import judged_by_surface, judged_by_voxels
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh, Peer

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import PinholeCamera
-from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.evaluation.artefacts import MAJORITY, Sightings
+from taichi_mrf.evaluation.bench import octomap_available
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.ledger import Result

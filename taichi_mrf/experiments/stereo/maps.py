@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.artefacts import LEAST_RAYS, MAJORITY, SIGMAS, Sightings, sightings
+from taichi_mrf.evaluation.bench import octomap_available
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment

@@ -10,12 +10,12 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, POSE_UNITS, RANGE, Conventions
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, out_of_sight
 from taichi_mrf.datasets.derived import Derived, Mended, Resampled
+from taichi_mrf.datasets.doctor.carried import carried_along
+from taichi_mrf.datasets.doctor.readings import UNITS, Reading
+from taichi_mrf.datasets.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
+from taichi_mrf.datasets.doctor.views import Sample, read_sample
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.datasets.recorded_noise import note_of_filling
-from taichi_mrf.doctor.carried import carried_along
-from taichi_mrf.doctor.readings import UNITS, Reading
-from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, SEEN_THROUGH, Search
-from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf import Config, Frame, MRFMap
-from taichi_mrf.benchmark.keyframe_cost import KeyframeCost, Seconds, add_timed, timed, warm_up
+from taichi_mrf.evaluation.keyframe_cost import KeyframeCost, Seconds, add_timed, timed, warm_up
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
 from taichi_mrf.voxels.layout import VOXELS
 

@@ -11,12 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.mapping.settling import FullInference
-from taichi_mrf.queries.points import probability
-from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import Job
-from taichi_mrf.submaps.round_files import (
+from taichi_mrf.cluster.submaps.partial_map import PartialMap
+from taichi_mrf.cluster.submaps.plan import Job
+from taichi_mrf.cluster.submaps.round_files import (
     Bricks,
     Halo,
     LogOdds,
@@ -28,6 +25,9 @@ from taichi_mrf.submaps.round_files import (
     round_path,
     write_round,
 )
+from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.mapping.settling import FullInference
+from taichi_mrf.queries.points import probability
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
 from taichi_mrf.voxels.layers import COLORS, FIRST, SURFACE, BrickValues

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.cluster.runner import TaskRunner
+from taichi_mrf.cluster.submaps.partial_map import PartialMap
+from taichi_mrf.cluster.submaps.plan import SeenFrame, SourceFrames
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Z_UP, Up, up_of
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
-from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import SeenFrame, SourceFrames
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import CHUNK
 

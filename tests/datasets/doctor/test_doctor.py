@@ -18,12 +18,12 @@ from stereo_rig import write_kitti
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.conventions import Conventions
+from taichi_mrf.datasets.doctor.diagnosis import Diagnosis, Finding, diagnose, doubtful_at_a_glance, mistakes
+from taichi_mrf.datasets.doctor.picture import overlap
+from taichi_mrf.datasets.doctor.remedy import remedy
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.doctor.diagnosis import Diagnosis, Finding, diagnose, doubtful_at_a_glance, mistakes
-from taichi_mrf.doctor.picture import overlap
-from taichi_mrf.doctor.remedy import remedy
 from taichi_mrf.errors import DatasetError, ReadWrongError
 from taichi_mrf.geometry.poses import inverse, look_at
 from taichi_mrf.sensor.frame import Frame
@@ -470,7 +470,7 @@ def test_a_command_that_does_not_mend_a_recording_is_not_named(
     room: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = Diagnosis((Finding("poses are in centimetres", "--poses-are cm"),), before=0.2, after=0.001)
-    monkeypatch.setattr("taichi_mrf.doctor.remedy.diagnose", lambda *each: wrong)
+    monkeypatch.setattr("taichi_mrf.datasets.doctor.remedy.diagnose", lambda *each: wrong)
     assert carry_out("doctor", write_numbered(tmp_path / "mine", room[:4])) == 4
     said = capsys.readouterr().out
     assert "--poses-are cm" not in said

@@ -9,10 +9,10 @@ from pathlib import Path
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AXIAL, conventions_of
 from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.doctor.diagnosis import Diagnosis, as_stored, diagnose, unexplained
 from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.doctor.diagnosis import Diagnosis, as_stored, diagnose, unexplained
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 
 _ROUNDS = 3

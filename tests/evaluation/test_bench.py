@@ -18,12 +18,12 @@ from benchmarks.speed.__main__ import main as speed_main
 from benchmarks.speed.bandwidth import copy_bandwidth
 from benchmarks.speed.growth import elsewhere, fit_line, measure_growth
 from benchmarks.speed.profile import COPIES, FLOORS, Work, host_seconds
-from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
-from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, live_stages
 from taichi_mrf.cli import bench as bench_command
 from taichi_mrf.cli.options.measure import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.bench import TARGETS, bench_mapping, octomap_available
+from taichi_mrf.evaluation.keyframe_cost import Seconds, add_timed, live_stages
 from taichi_mrf.methods.mrf.map import MRFMap
 
 COARSE = Config(voxel_size=small_room.VOXEL_SIZE)

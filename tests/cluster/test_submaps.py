@@ -20,6 +20,11 @@ from small_room import VOXEL_SIZE, add, frames
 
 from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.cluster.local import LocalProcesses
+from taichi_mrf.cluster.submaps.partial_map import PartialMap
+from taichi_mrf.cluster.submaps.plan import Job, Plan, SeenFrame, SourceFrames, chunks_for, plan_submaps
+from taichi_mrf.cluster.submaps.round_files import read_core, read_report, round_path
+from taichi_mrf.cluster.submaps.rounds import SubmapsResult, map_in_submaps
+from taichi_mrf.cluster.submaps.task import share_moved
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.datasets.own_body import OwnBody
@@ -30,11 +35,6 @@ from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.submaps.partial_map import PartialMap
-from taichi_mrf.submaps.plan import Job, Plan, SeenFrame, SourceFrames, chunks_for, plan_submaps
-from taichi_mrf.submaps.round_files import read_core, read_report, round_path
-from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
-from taichi_mrf.submaps.task import share_moved
 from taichi_mrf.voxels.layers import LOG_ODDS
 from taichi_mrf.voxels.layout import CHUNK
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.doctor.readings import Reading
-from taichi_mrf.doctor.search import NEARER, Search, seen_by
+from taichi_mrf.datasets.doctor.readings import Reading
+from taichi_mrf.datasets.doctor.search import NEARER, Search, seen_by
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 

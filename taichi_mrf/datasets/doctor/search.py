@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.conventions import AXES, POSE_UNITS, TURNS
 from taichi_mrf.datasets.depth_scale import SeenAgain, pixels_of, seen_again
 from taichi_mrf.datasets.derived import pose_of
+from taichi_mrf.datasets.doctor.readings import LENSES, UNITS, Reading
+from taichi_mrf.datasets.doctor.views import REACH_S, Floats, Sample, Sphere, View
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.turned import T_sensor_stored
-from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
-from taichi_mrf.doctor.views import REACH_S, Floats, Sample, Sphere, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 

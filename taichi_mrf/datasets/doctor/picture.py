@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.doctor.diagnosis import Diagnosis
-from taichi_mrf.doctor.readings import Reading
-from taichi_mrf.doctor.search import Search, points_of, seen_by
-from taichi_mrf.doctor.views import thinned
+from taichi_mrf.datasets.doctor.diagnosis import Diagnosis
+from taichi_mrf.datasets.doctor.readings import Reading
+from taichi_mrf.datasets.doctor.search import Search, points_of, seen_by
+from taichi_mrf.datasets.doctor.views import thinned
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _POINTS = 200_000

@@ -7,11 +7,11 @@ import pytest
 from armed_room import record, write
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.doctor.carried import carried_along
-from taichi_mrf.doctor.diagnosis import diagnose
-from taichi_mrf.doctor.readings import Reading
-from taichi_mrf.doctor.search import Search
-from taichi_mrf.doctor.views import read_sample
+from taichi_mrf.datasets.doctor.carried import carried_along
+from taichi_mrf.datasets.doctor.diagnosis import diagnose
+from taichi_mrf.datasets.doctor.readings import Reading
+from taichi_mrf.datasets.doctor.search import Search
+from taichi_mrf.datasets.doctor.views import read_sample
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from taichi_mrf.benchmark.bench import BenchRow
+from taichi_mrf.evaluation.bench import BenchRow
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.system.atomic import atomic_path
 

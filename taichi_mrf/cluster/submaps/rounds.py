@@ -10,6 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.cluster.runner import TaskRunner
+from taichi_mrf.cluster.submaps.plan import PLAN_FILE, Job, SourceFrames, plan_submaps
+from taichi_mrf.cluster.submaps.round_files import (
+    SubmapReport,
+    read_core,
+    read_layer,
+    read_places,
+    read_report,
+    round_path,
+)
+from taichi_mrf.cluster.submaps.survey import find_keyframes
+from taichi_mrf.cluster.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
@@ -20,17 +31,6 @@ from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.inference.ray_model import Limits
-from taichi_mrf.submaps.plan import PLAN_FILE, Job, SourceFrames, plan_submaps
-from taichi_mrf.submaps.round_files import (
-    SubmapReport,
-    read_core,
-    read_layer,
-    read_places,
-    read_report,
-    round_path,
-)
-from taichi_mrf.submaps.survey import find_keyframes
-from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.voxels.layers import LOG_ODDS, BrickValues, known_log_odds
 from taichi_mrf.voxels.layout import CHUNK, VOXELS

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.cluster.submaps.plan import Plan
 from taichi_mrf.evaluation.pictures.figures import draw_way, new_figure
 from taichi_mrf.export.map_server import grey_image
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.queries.points import probability
-from taichi_mrf.submaps.plan import Plan
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
