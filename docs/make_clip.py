@@ -76,7 +76,7 @@ def keyframes_arriving(page: LivePage) -> list[Image.Image]:
 
 def orbit(page: LivePage) -> list[Image.Image]:
     """A turn around the map, by dragging the mouse beside it."""
-    shots, mouse, (x, y) = [], page.page.mouse, (0.3 * WIDTH, 0.9 * HEIGHT)
+    shots, mouse, (x, y) = [], page.page.mouse, (0.3 * WIDTH, 0.1 * HEIGHT)
     mouse.move(x, y)
     mouse.down()
     for i in range(1, ORBIT_SHOTS + 1):
@@ -90,7 +90,7 @@ def cut_moving_through(page: LivePage) -> list[Image.Image]:
     """A level cut that moves down through the room and shows free space."""
     shots = []
     level_cut(page, CUT_FROM)
-    page.page.mouse.move(0.3 * WIDTH, 0.9 * HEIGHT)
+    page.page.mouse.move(0.3 * WIDTH, 0.1 * HEIGHT)
     for share in np.linspace(CUT_FROM, CUT_TO, CUT_SHOTS):
         level_cut(page, float(share))
         page.until(lambda seen: seen.agrees, "the cut")

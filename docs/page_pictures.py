@@ -59,7 +59,7 @@ def live_surface(page: LivePage) -> Image.Image:
     page.tab("Map")
     page.show("surface", "height")
     page.until(lambda seen: seen.settled and seen.triangles, "the surface")
-    picture = shot(page).crop((0, 150, 940, 770)).resize((480, 317), Image.Resampling.LANCZOS)
+    picture = shot(page).crop((0, 85, 940, 705)).resize((480, 317), Image.Resampling.LANCZOS)
     page.show("voxels", "marginal probability")
     page.until_settled()
     return picture
@@ -75,7 +75,7 @@ def live_lidar(page: LivePage) -> Image.Image:
     for _ in range(4):
         page.page.mouse.wheel(0, -240)
         page.pause(0.3)
-    return shot(page).crop((0, 220, 940, 790)).resize((564, 342), Image.Resampling.LANCZOS)
+    return shot(page).crop((0, 135, 940, 705)).resize((564, 342), Image.Resampling.LANCZOS)
 
 
 def live_keyframes(page: LivePage) -> Image.Image:

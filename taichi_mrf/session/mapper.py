@@ -457,4 +457,5 @@ class Mapper:
             crossed,
             entry.T_home,
             entry.earlier,
+            entry.stamp_s,
         )

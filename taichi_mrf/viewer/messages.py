@@ -145,7 +145,7 @@ class KeyframeInfo(Update):
     ``picture`` is a small depth image in colours, (h, w, 3) uint8. If ``camera`` is no pinhole, it is that of
     the picture's pixels; ``crossed`` (n, 3) int32 are the bricks
     that its rays cross, which are free where the map has no voxels. ``T_home`` is the pose that *Put back*
-    restores. ``earlier``: it is of the map that the recording has joined.
+    restores. ``earlier``: it is of the map that the recording has joined. ``stamp_s`` counts as stamps do.
     """
 
     id: int
@@ -158,6 +158,7 @@ class KeyframeInfo(Update):
     crossed: NDArray[np.int32]
     T_home: Pose
     earlier: bool = False
+    stamp_s: float = 0.0
 
 
 @dataclass(frozen=True)

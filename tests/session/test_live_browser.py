@@ -511,11 +511,11 @@ def test_the_ground_and_the_axes_come_and_go(page: LivePage, saved: MRFMap) -> N
     levels_m, voxels = np.unique(saved.decided.voxels(0.5)[0][:, 2], return_counts=True)
     floor_m = levels_m[np.argmax(voxels)]
     assert abs(page.position("/ground")[2] - floor_m) < 1.01 * saved.voxel_size
-    assert "ground in squares of 1 m" in page.text()
+    assert "ground: 1 m squares" in page.text()
     for label, node in (("Ground", "/ground"), ("Axes", "/WorldAxes")):
         page.tick(label, on=False)
         page.until(lambda seen, node=node: node not in seen.nodes, f"no {node}")
-    assert "in squares of" not in page.text()  # a tooltip may tell of squares
+    assert "1 m squares" not in page.text()  # a tooltip may tell of squares
     for label, node in (("Ground", "/ground"), ("Axes", "/WorldAxes")):
         page.tick(label)
         page.until(lambda seen, node=node: node in seen.nodes, node)

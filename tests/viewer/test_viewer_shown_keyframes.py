@@ -24,7 +24,7 @@ def bricks(roster: ShownKeyframes) -> set[tuple[int, ...]]:
 
 def places(roster: ShownKeyframes) -> np.ndarray:
     """Where along x the camera's path leads, from line to line."""
-    lines = roster.way_m()[:, :, 0]
+    lines = roster.way()[0][:, :, 0]
     np.testing.assert_array_equal(lines[1:, 0], lines[:-1, 1])
     return np.append(lines[:1, 0], lines[:, 1])
 
@@ -71,5 +71,5 @@ def test_no_line_leads_from_an_earlier_day_to_today() -> None:
     roster = ShownKeyframes()
     for id in range(3 * MOST_FROZEN):
         roster.put(replace(keyframe(id, "frozen"), earlier=id < 7))
-    steps = roster.way_m()[:, :, 0].tolist()
+    steps = roster.way()[0][:, :, 0].tolist()
     assert steps == [[id, id + 1] for id in range(3 * MOST_FROZEN - 1) if id != 6]

@@ -147,7 +147,7 @@ def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePa
     assert scene.scale is not None
     assert "chance" in scene.scale.measure.label  # voxels show how sure the map is while it grows
     drawn.take(VIEW)
-    assert drawn.draw() == "2 triangles of the measured surface shown"
+    assert drawn.draw() == "2 triangles shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
     vertices, triangles, _ = drawn.mesh()
     np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)

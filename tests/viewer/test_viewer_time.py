@@ -1,4 +1,4 @@
-"""The folder "Time" of the live page, without a mapping process: its slider, its list, dynamic voxels."""
+"""The strip of time along the live page's foot, without a mapping process; dynamic voxels."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import viser
 from handled_page import HandledPage
+from numpy.typing import NDArray
 
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import PLAY_TIME
+from taichi_mrf.viewer.live.time_strip import PLAY_TIME
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 
@@ -86,10 +88,10 @@ def test_the_list_says_what_happened_and_when(running: TimePage) -> None:
     assert not running.time._list.visible
 
 
-def test_a_static_map_has_no_folder(running: TimePage) -> None:
-    assert running.time.folder.visible
+def test_a_static_map_has_no_strip(running: TimePage) -> None:
+    assert running.time.strip.visible
     running.take(replace(HELLO, has_dates=False))
-    assert not running.time.folder.visible
+    assert not running.time.strip.visible
 
 
 def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> None:
@@ -107,7 +109,7 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     assert (greys(running), red(running)) == (33, 7)
     running.page.show_counts()
     shown = running.page.panel._shown.content
-    assert shown == "40 voxels shown, 7 that move · ground in squares of 0.1 m"
+    assert shown == "40 voxels shown, 7 that move · ground: 0.1 m squares"
     chair = m.SceneChange(START_S, "left", (0.5, 0.6, 0.7), (1.0, 2.0, 0.4))
     running.take(m.SceneChanges((chair,)))
     assert red(running) == 7
@@ -144,3 +146,36 @@ def colors(running: TimePage) -> np.ndarray:
 
 def red(running: TimePage) -> int:
     return int((colors(running) == DYNAMIC_COLOR).all(axis=1).sum())
+
+
+def test_scrubbing_shows_how_far_the_camera_had_come_and_what_it_saw(running: TimePage) -> None:
+    camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+    for id, second in enumerate((0.0, 3.0, 6.0)):
+        T = np.eye(4)
+        T[0, 3] = id
+        picture = np.full((2, 2, 3), 40 * id, np.uint8)
+        stamp_s = START_S + second
+        running.take(
+            m.KeyframeInfo(id, f"view {id}", T, camera, 1, "on", picture, NOTHING, T, False, stamp_s)
+        )
+    running.span(6.0)
+    assert [mark.value for mark in running.time.slider._marks if mark.label is None] == [0.0, 3.0, 6.0]
+
+    def steps() -> NDArray[np.uint8]:
+        """The colours of the two steps of the camera's path."""
+        way = running.server.scene.get_handle_by_name("/way")
+        assert isinstance(way, viser.LineSegmentsHandle)
+        assert (way.colors[:, 0] == way.colors[:, 1]).all()
+        return way.colors[:, 0]
+
+    assert (steps()[0] == steps()[1]).all()
+    past = steps()[0]
+    running.move_to(4.0)
+    assert (steps()[0] == past).all()
+    assert (steps()[1] != past).any()
+    assert "view 1, of 3.0 s" in running.time._list.content
+    running.move_to(4.9)
+    assert "view 2, of 6.0 s" in running.time._list.content
+    running.span(6.0)
+    assert (steps() == past).all()
+    assert not running.time._list.visible

@@ -9,6 +9,7 @@ from live_program import wait_for
 from numpy.typing import NDArray
 from raw_viewer_client import RawClient, camera_message, raw_client
 
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.viewpoint import fitting_eye
@@ -133,3 +134,24 @@ def test_a_single_voxel_can_be_looked_at() -> None:
         running.server.stop()
     assert target[1:] == pytest.approx([1, 1])
     assert eye[1] < 1.0
+
+
+def test_a_hidden_map_is_not_fitted_but_the_keyframes_that_are_seen(
+    handled: HandledPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, fitted = handled.page, []
+    monkeypatch.setattr(page.viewpoint, "look_from", lambda client, side, points: fitted.append(points))
+    crossed, picture = np.zeros((0, 3), np.int32), np.zeros((2, 2, 3), np.uint8)
+    for id in range(2):
+        T = np.eye(4)
+        T[0, 3] = 50.0 + id
+        camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+        handled.take(m.KeyframeInfo(id, "view", T, camera, 1, "on", picture, crossed, T))
+    for name in ("map", "path", "keyframes"):
+        page.panel.view_options.handles[name].value = False
+        page._take_options()
+        page._flush()
+        page.actions["Fit"](0)
+    assert len(fitted) == 2  # and nothing once the keyframes are hidden, too
+    for points in fitted:
+        np.testing.assert_array_equal(np.unique(points, axis=0), [[50.0, 0.0, 0.0], [51.0, 0.0, 0.0]])

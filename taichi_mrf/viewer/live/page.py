@@ -16,7 +16,6 @@ from taichi_mrf.viewer.live.panel import (
     AGREE,
     CHOSEN_KEYFRAME,
     DECLINE,
-    PLAY_TIME,
     POSITION_STEP_M,
     SPEEDS,
     Clicked,
@@ -24,6 +23,7 @@ from taichi_mrf.viewer.live.panel import (
     Framed,
     Panel,
 )
+from taichi_mrf.viewer.live.time_strip import PLAY_TIME
 from taichi_mrf.viewer.scene.base_page import POP_UP_S, BasePage
 from taichi_mrf.viewer.scene.base_panel import Inbox
 from taichi_mrf.viewer.scene.coloring import COLORINGS
@@ -65,7 +65,7 @@ class Page(BasePage[Panel]):
             m.RayAnswer: self._show_ray,
             m.Votes: self._show_votes,
             m.Images: self.panel.show_images,
-            m.TimeSpan: self.panel.time.show_span,
+            m.TimeSpan: self._take_span,
             m.SceneChanges: self._take_changes,
             m.MeasuredPoints: self._take_points,
             Clicked: self._clicked,
@@ -95,7 +95,7 @@ class Page(BasePage[Panel]):
             "Show the ray": lambda client: self._edit(lambda k: m.PixelRay(k.id, *self.panel.pixel.value)),
             "Show images": lambda client: self._watch_images(),
             "View": lambda client: self._watch_images(),
-            "Time (s)": lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
+            "Time (s)": self._scrub,
             PLAY_TIME: lambda client: ask(m.ShowTime(self.panel.time.played_s(), play=True)),
             "Map (.npz)": lambda client: ask(m.Save("map", client)),
             "Voxels (.ply)": lambda client: ask(m.Save("ply", client)),
@@ -188,6 +188,20 @@ class Page(BasePage[Panel]):
         if self.map is not None:
             self.map.move_measured(keyframe.id, keyframe.T_world_camera)
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)
+
+    def _take_span(self, span: m.TimeSpan) -> None:
+        self.panel.time.show_span(span, self.keyframes.keyframes.values())
+        self._show_way_until(span.shown_s)
+
+    def _scrub(self, client: int) -> None:
+        """Show where the camera was at the chosen time at once; the map of that time comes later."""
+        stamp_s = self.panel.time.chosen_s()
+        self._show_way_until(stamp_s)
+        self.ask(m.ShowTime(stamp_s))
+
+    def _show_way_until(self, stamp_s: float | None) -> None:
+        self.keyframes.show_until(stamp_s)
+        self.panel.time.show_nearest(self.keyframes.keyframes.values(), stamp_s)
 
     def _take_changes(self, changes: m.SceneChanges) -> None:
         self.panel.time.show_changes(changes)

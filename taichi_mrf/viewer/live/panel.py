@@ -1,4 +1,4 @@
-"""The widgets of the live page, with the folder "Time" of a map whose world may change."""
+"""The widgets of the live page."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.time_strip import TimeStrip
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.view_options import ViewOptions
@@ -71,8 +72,6 @@ CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
-TIME_STEP_S, PLAY_TIME = 0.1, "Play through time"
-
 
 class Panel(BasePanel):
     """Adds the widgets, and shows values in them."""
@@ -102,26 +101,26 @@ class Panel(BasePanel):
         hint = "Ctrl-Z takes the last edit back, Ctrl-Shift-Z makes it again; a frozen keyframe stays."
         self._history: Any = self.add_buttons("Edits", HISTORY_BUTTONS, hint)
         self.show_history(False, False)
-        self.time = TimeFolder(gui, self)
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Map", viser.Icon.CUBE):
+        with tabs.add_tab("Map"):
             self.add_layers("follow")
             self.add_button(*self.DARK_OR_LIGHT)
-        with tabs.add_tab("Keyframes", viser.Icon.CAMERA):
+        with tabs.add_tab("Keyframes"):
             self._keyframe_tab()
-        with tabs.add_tab("Ray", viser.Icon.CHART_LINE):
+        with tabs.add_tab("Ray"):
             self._ray_tab(scene)
-        with tabs.add_tab("Images", viser.Icon.PHOTO):
+        with tabs.add_tab("Images"):
             self._images_tab()
-        with tabs.add_tab("Save", viser.Icon.DOWNLOAD):
+        with tabs.add_tab("Save"):
             self.unsaved = gui.add_markdown("The map has changes that are not saved.", visible=False)
             self._size = gui.add_markdown("")
             for name, hint in SAVE_BUTTONS.items():
                 self.add_button(name, hint)
-        with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
+        with tabs.add_tab("About"):
             self._numbers = gui.add_html("")
             self.add_notices()
             self._parameters = gui.add_html("")
+        self.time = TimeStrip(gui, self)
 
     def show_hello(self, hello: m.Hello) -> None:
         """Show the source, the backend and the parameters."""
@@ -307,79 +306,3 @@ class Panel(BasePanel):
         }
         black = np.zeros((2, 2, 3), np.uint8)
         self._pictures = {n: gui.add_image(black, label=label, visible=False) for n, label in labels.items()}
-
-
-class TimeFolder:
-    """Adds the folder at the place where the GUI stands. Times on the page count from the first keyframe."""
-
-    def __init__(self, gui: viser.GuiApi, panel: BasePanel) -> None:
-        self._span: m.TimeSpan | None = None
-        self._latest: tuple[m.SceneChange, ...] = ()
-        self.folder = gui.add_folder("Time", visible=False)
-        with self.folder:
-            hint = (
-                "Show the map as it was believed at this time, in all browsers. The right end is now "
-                "and follows new keyframes. An edit returns to now."
-            )
-            step = TIME_STEP_S
-            slider = gui.add_slider("Time (s)", 0.0, step, step, step, disabled=True, hint=hint)
-            self.slider = panel.watch(slider)
-            self._play = panel.add_button(
-                PLAY_TIME,
-                "Show the map from this time on, or from its first keyframe, until now.",
-                disabled=True,
-            )
-            self._list = gui.add_html("", visible=False)
-
-    def begin(self, has_dates: bool) -> None:
-        """Start with an empty map; the folder is there if it ``has_dates``."""
-        self._span, self._latest = None, ()
-        self.slider.disabled = self._play.disabled = True
-        self.folder.visible = has_dates
-        self._show_list()
-
-    def chosen_s(self) -> float | None:
-        """The stamp of the time on the slider, None at its right end, which is now."""
-        if self._span is None or self.slider.value >= self.slider.max - 0.5 * TIME_STEP_S:
-            return None
-        return max(self._span.first_s, self._span.start_s + float(self.slider.value))
-
-    def played_s(self) -> float | None:
-        """The stamp of the time from which the map is played."""
-        chosen_s = self.chosen_s()
-        return self._span.first_s if chosen_s is None and self._span is not None else chosen_s
-
-    def show_span(self, span: m.TimeSpan) -> None:
-        """Set the slider's ends, and the time that is shown."""
-        known, self._span = self._span is not None, span
-        last_s = max(_on_grid(span.now_s - span.start_s), TIME_STEP_S)
-        first_s = min(_on_grid(span.first_s - span.start_s), last_s - TIME_STEP_S)
-        shown_s = last_s if span.shown_s is None else _on_grid(span.shown_s - span.start_s)
-        disabled = span.now_s <= span.first_s
-        change(self.slider, min=first_s, max=last_s, value=shown_s, disabled=disabled)
-        change(self._play, disabled=disabled)
-        if not known:
-            self._show_list()
-
-    def show_changes(self, changes: m.SceneChanges) -> None:
-        """List what has appeared and left, the latest first."""
-        self._latest = changes.changes
-        self._show_list()
-
-    def _show_list(self) -> None:
-        """The list takes no room until there is something to tell."""
-        start_s = 0.0 if self._span is None else self._span.start_s
-        lines = [_in_words(change, start_s) for change in self._latest]
-        self._list.visible = bool(lines)
-        items = "".join(f"<div>{in_html(line)}</div>" for line in lines)
-        self._list.content = f'<div style="padding:0 0.75em;font-size:0.8em">{items}</div>'
-
-
-def _in_words(change: m.SceneChange, start_s: float) -> str:
-    size = " x ".join(f"{side:.1f}" for side in change.size_m)
-    centre = ", ".join(f"{value:.1f}" for value in change.centre_m)
-    return f"{change.stamp_s - start_s:.1f} s: something of {size} m {change.verb} at ({centre})"
-
-
-def _on_grid(seconds: float) -> float:
-    return round(round(seconds / TIME_STEP_S) * TIME_STEP_S, 6)

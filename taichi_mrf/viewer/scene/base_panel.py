@@ -141,14 +141,10 @@ class BasePanel:
         """Show how much the page shows, by the names that MapScene.counts has, how wide the squares on the
         ground are if there are any, and whether the scene is being recorded."""
         triangles = counts.get("triangles")
-        text = (
-            f"{counts['map']:,} voxels"
-            if triangles is None
-            else f"{triangles:,} triangles of the measured surface"
-        )
+        text = f"{counts['map']:,} voxels" if triangles is None else f"{triangles:,} triangles"
         others = (f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts.get(name))
         text += "".join([" shown", *others])
-        text += "" if square_m is None else f" · ground in squares of {square_m:g} m"
+        text += "" if square_m is None else f" · ground: {square_m:g} m squares"
         self._shown.content = text + (" · recording" if recording else "")
 
     def show_cut(self, ends_m: NDArray[np.float64] | None, in_middle: bool = False) -> None:
@@ -195,7 +191,7 @@ class BasePanel:
 
 def _activity_html(text: str) -> str:
     """Activity in an element that the page hides while nothing answers it."""
-    return f'<p class="{ACTIVITY}" style="margin:0.5em 0.75em">{in_html(text)}</p>'
+    return f'<p class="{ACTIVITY}" style="margin:0.1em 0.75em">{in_html(text)}</p>'
 
 
 def rows_html(rows: Mapping[str, str]) -> str:

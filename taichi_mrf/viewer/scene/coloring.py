@@ -5,18 +5,17 @@ A colouring is one entry of :data:`COLORINGS`: the page offers it where the map 
 from the numbers that are there, and shows its help. Layers that pixels feed bring theirs (voxels/layers.py).
 """
 
-import base64
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
+from taichi_mrf.viewer.scene.widgets import image_html
 from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layers import COLORS, OnPage, pixel_layers
 
@@ -249,15 +248,12 @@ def legend_html(scale: Scale) -> str:
     if not len(scale.colors):
         said = f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
         return said + _swatches(dict(scale.measure.key))
-    strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
     ends = f"{scale.low:.3g}", label, f"{scale.high:.3g}"
     named = scale.measure.marks(scale.low, scale.high) or ends
     below = "" if label in named else f'<div style="text-align:center">{label}</div>'
-    png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
     return (
         '<div style="padding:0 0.75em;font-size:0.85em">'
-        f'<img alt="{label}" style="width:100%;height:0.9em;image-rendering:pixelated" '
-        f'src="data:image/png;base64,{png}">'
+        f"{image_html(scale.colors[None], 'width:100%;height:0.9em;image-rendering:pixelated', label)}"
         '<div style="display:flex;justify-content:space-between">'
         f"{''.join(f'<span>{name}</span>' for name in named)}</div>{below}</div>"
     )
@@ -265,19 +261,19 @@ def legend_html(scale: Scale) -> str:
 
 def key_html(space: bool, changes: bool) -> str:
     """Key to the colours that are not on the scale, for the page: those of free space, and of changes."""
-    named = dict(SPACE_COLORS) if space else {}
+    named: dict[str, tuple[int, ...]] = {**SPACE_COLORS, "unknown: nothing": (0, 0, 0, 0)} if space else {}
     if changes:
-        named |= {"moves: occupied now, usually free": DYNAMIC_COLOR, **CHANGE_COLORS}
-    return _swatches(named, " · unknown: nothing" if space else "")
+        named |= {"moves": DYNAMIC_COLOR, **CHANGE_COLORS}
+    return _swatches(named)
 
 
-def _swatches(named: Mapping[str, tuple[int, int, int]], beside: str = "") -> str:
+def _swatches(named: Mapping[str, tuple[int, ...]]) -> str:
     swatch = "display:inline-block;width:0.8em;height:0.8em;margin:0 0.4em 0 0.75em"
     spans = "".join(
         f'<div style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
-    return f'<div style="font-size:0.85em">{spans}{beside}</div>' if named else ""
+    return f'<div style="font-size:0.85em">{spans}</div>' if named else ""
 
 
 def probabilities() -> NDArray[np.float64]:

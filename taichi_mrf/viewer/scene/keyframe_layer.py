@@ -33,6 +33,7 @@ LEAST_TO_MERGE = 4096
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
+_AHEAD = (190, 195, 202)
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
@@ -59,7 +60,7 @@ class ShownKeyframes:
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}
-        self._old_way: list[tuple[bool, NDArray[np.float64]]] = []  # of earlier maps or not
+        self._old_way: list[tuple[bool, float, NDArray[np.float64]]] = []  # of earlier maps or not, stamp
         self._old_crossed: list[NDArray[np.int32]] = []
         self._merged = 0
         self._every, self._forgotten = 1, 0
@@ -74,13 +75,15 @@ class ShownKeyframes:
             self._forget(id)
         return forgotten
 
-    def way_m(self) -> NDArray[np.float64]:
-        """The camera's path, lines (n, 2, 3) in metres, world, oldest first; a long path is thinned out. None
-        leads from an earlier map's last keyframe to the first after it."""
+    def way(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The camera's path, lines (n, 2, 3) in metres, world, oldest first, and the stamps (n,) of their
+        ends; a long path is thinned out. None leads from an earlier map's last keyframe to the first after
+        it."""
         known = [self.keyframes[id] for id in sorted(self.keyframes)]
-        way = [*self._old_way, *((each.earlier, each.T_world_camera[:3, 3]) for each in known)]
-        lines = [(a, b) for (before, a), (after, b) in itertools.pairwise(way) if before == after]
-        return np.array(lines, np.float64).reshape(-1, 2, 3)
+        way = [*self._old_way, *((each.earlier, each.stamp_s, each.T_world_camera[:3, 3]) for each in known)]
+        steps = [(a, b, s) for (before, _, a), (after, s, b) in itertools.pairwise(way) if before == after]
+        lines = np.array([step[:2] for step in steps], np.float64).reshape(-1, 2, 3)
+        return lines, np.array([step[2] for step in steps])
 
     def crossed(self) -> list[NDArray[np.int32]]:
         """Bricks (n, 3) that rays of keyframes cross; keyframes that are off are left out."""
@@ -95,7 +98,7 @@ class ShownKeyframes:
             self._old_crossed = [np.unique(np.concatenate(self._old_crossed), axis=0).astype(np.int32)]
             self._merged = len(self._old_crossed[0])
         if self._forgotten % self._every == 0:
-            self._old_way.append((keyframe.earlier, keyframe.T_world_camera[:3, 3]))
+            self._old_way.append((keyframe.earlier, keyframe.stamp_s, keyframe.T_world_camera[:3, 3]))
         self._forgotten += 1
         if len(self._old_way) > MOST_WAYPOINTS:
             self._old_way = self._old_way[::2]
@@ -117,6 +120,7 @@ class KeyframeLayer:
         self._places: dict[int, int] = {}
         self._free_places: list[int] = []
         self._pictures = self._path = True
+        self._until_s: float | None = None
 
     @property
     def keyframes(self) -> dict[int, KeyframeInfo]:
@@ -154,11 +158,20 @@ class KeyframeLayer:
             for id in list(self._places):
                 self._draw(self.keyframes[id])
 
+    def show_until(self, stamp_s: float | None) -> None:
+        """Highlight the camera's path up to a time; None: all of it."""
+        if stamp_s != self._until_s:
+            self._until_s = stamp_s
+            self.draw_way()
+
     def draw_way(self) -> None:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
-        lines = self.roster.way_m()
+        lines, stamps_s = self.roster.way()
         if len(lines):
-            draw_lines(self._scene, "/way", lines, _WAY, visible=self._path)
+            ahead = np.zeros(len(lines), bool) if self._until_s is None else stamps_s > self._until_s
+            colors = np.where(ahead[:, None], _AHEAD, _WAY).astype(np.uint8)
+            colors = np.repeat(colors[:, None], 2, axis=1)
+            draw_lines(self._scene, "/way", lines, colors, visible=self._path)
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
@@ -205,7 +218,7 @@ class KeyframeLayer:
         self._places.clear()
         self._free_places.clear()
         self.roster = ShownKeyframes()
-        self.chosen = None
+        self.chosen = self._until_s = None
         for name in ("/way", "/camera"):
             self._scene.remove_by_name(name)
 

@@ -136,12 +136,12 @@ class MapScene:
         return self.surface.points() if self.shows_surface else self.layers["map"].points()
 
     def seen_points(self) -> NDArray[np.float64]:
-        """Points (n, 3) of all that is seen of both maps, in metres, world; of the map if that is nothing."""
+        """Points (n, 3) of all that is seen of both maps, in metres, world."""
         seen = [self.points(), self.layers["baseline"].points()]
         if self._options.points and self._points is not None and self._measured is not None:
             turned = vtf.SO3(self._points.wxyz).apply(self._measured.points_m.astype(np.float64))
             seen.append(turned + self._points.position)
-        return np.concatenate(seen) if any(map(len, seen)) else self.layers["map"].points()
+        return np.concatenate(seen)
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""

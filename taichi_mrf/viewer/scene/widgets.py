@@ -6,6 +6,7 @@ not written in this package passes through one of these two functions before it 
 widget. Other widgets (dropdowns, labels, notifications) show plain text.
 """
 
+import base64
 import dataclasses
 import html
 import string
@@ -14,7 +15,10 @@ import unicodedata
 from collections.abc import Callable, Container, Sequence
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
+import cv2
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from taichi_mrf.config.method import Range
 from taichi_mrf.config.text import field_help
@@ -39,6 +43,12 @@ def in_markdown(text: str) -> str:
 def in_html(text: str) -> str:
     """HTML that reads as ``text``, inside an element or an attribute in quotes; line breaks stay."""
     return "\n".join(html.escape(_visible(line)) for line in text.split("\n"))
+
+
+def image_html(picture: NDArray[np.uint8], style: str, alt: str = "") -> str:
+    """An RGB picture (h, w, 3) as an element of HTML."""
+    png = base64.b64encode(cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes())
+    return f'<img alt="{in_html(alt)}" style="{style}" src="data:image/png;base64,{png.decode("ascii")}">'
 
 
 def _visible(text: str) -> str:

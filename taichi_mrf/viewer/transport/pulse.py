@@ -106,6 +106,10 @@ for (const [event, inner] of [["mouseover", "mouseenter"], ["mouseout", "mousele
 const style = document.createElement("style");
 style.textContent = `
   [style*="min-width: fit-content"] { padding-inline: 0.3em !important; }  /* five buttons in a row */
+  [data-dock-tab] { padding-inline: 0.5em !important; }  /* six tabs in a row */
+  [style*="padding-bottom: 0.5em"] { padding-bottom: 0.3em !important; }  /* all layers without scrolling */
+  p:has(> label[for]) { color: inherit !important; }  /* grey on grey else */
+  [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }

@@ -7,7 +7,7 @@ start if they differ; ``tests/viewer/test_viser_internals.py`` says what to mend
 
 import operator
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from viser._assignable_props_api import AssignablePropsBase
 from viser._gui_handles import GuiModalHandle, _GuiInputHandle
 from viser._messages import (
     GetRenderResponseMessage,
+    GuiSliderMark,
     GuiUpdateMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
@@ -102,6 +103,14 @@ def tell_value(server: viser.ViserServer, client: int, uuid: str, value: Any) ->
     state = server._websock_server._client_state_from_id.get(client)
     if state is not None:
         state.message_buffer.push(GuiUpdateMessage(uuid, {"value": value}))
+
+
+def set_ticks(slider: viser.GuiSliderHandle[float], values: Sequence[float]) -> None:
+    """Draw a tick at each of some values of a slider, and numbers at its ends."""
+    ends = (GuiSliderMark(end, f"{end:g}") for end in (slider.min, slider.max))
+    ticks: Any = (*ends, *(GuiSliderMark(value, None) for value in values))
+    if slider._marks != ticks:
+        slider._marks = ticks
 
 
 def awaits_picture(server: viser.ViserServer, client: int) -> bool:
