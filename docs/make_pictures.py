@@ -34,7 +34,7 @@ ROOM = "synthetic:room"
 BUILDING = REPOSITORY.parent / "shared" / "data" / "lidar_building"
 FEW_SCANS = ("--keyframes.translation", "2.5", "--keyframes.rotation", "0")
 WIDTH = 1280
-MOST_BYTES = 120_000
+MOST_BYTES = 100_000
 QUALITIES = range(80, 40, -4)
 """Qualities of JPEG, from which the best with a small enough file is chosen."""
 
