@@ -13,6 +13,7 @@ What is given is up to a :class:`PixelVisitor`, which a layer names (voxels/laye
 voxel_colors.py.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,8 +48,7 @@ SHARE = 1.0 / 512.0
 so in a voxel that those do not meet."""
 
 _MOST = 1 << 30
-"""Nothing is added to a voxel that has a number of this size, for which 16,000 keyframes are needed: numbers
-have 31 bits."""
+"""Nothing is added to a number of 31 bits that is so large, for which 16,000 keyframes are needed."""
 
 
 @ti.dataclass
@@ -61,7 +61,7 @@ class _Ahead(Struct):
 
 
 @dataclass(frozen=True)
-class PixelVisitor(RayVisitor):
+class PixelVisitor(RayVisitor, ABC):
     """Adds what the pixels of rays say to the voxels that they see.
 
     ``image`` (H * W) is :meth:`packed`. A voxel's numbers go to the halves of ``sums`` (visible bricks * 512
@@ -79,9 +79,9 @@ class PixelVisitor(RayVisitor):
     most_many: F32
 
     @staticmethod
+    @abstractmethod
     def packed(image: NDArray[np.uint8]) -> NDArray[np.int32]:
         """The image beside depth (H, W, channels) as an integer for each pixel, (H * W)."""
-        raise NotImplementedError
 
     @ti.func
     def read(self, block: I32):
@@ -98,10 +98,10 @@ class PixelVisitor(RayVisitor):
         None is above 2^16."""
 
     @staticmethod
+    @abstractmethod
     def values(sums: Any) -> NDArray:
         """The layer's values (n, width) of the sums of voxels over keyframes, (n * words): a NumPy or a
         Taichi array (kernels/resident.py)."""
-        raise NotImplementedError
 
     @ti.func
     def stride(self, measured: F32, pixels: I32):

@@ -6,6 +6,7 @@ patch of pixels (MRFMap, section IV-C).
 """
 
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,6 @@ else:
 UNBIASED_STEPS = 5
 """Fixed-point steps from a measurement to the depth that gives it. Where the bias changes by less than a
 fifth of a metre in a metre, less than a thousandth of it is left."""
-
 
 Curves = tuple[NDArray[np.float64], NDArray[np.float64]]
 """sigma (at least LEAST_SIGMA_M) and bias at depths (n,), a row for each kind of pixel."""
@@ -95,9 +95,9 @@ class StoredNoise(Stored):
     sigma: NDArray[np.float64]
     bias: NDArray[np.float64]
 
+    @abstractmethod
     def table(self, camera: Camera) -> NoiseTable:
         """As NoiseModel has it."""
-        raise NotImplementedError
 
     def curves(self, depth_m: NDArray[np.float64]) -> Curves:
         """What pictures show at depths (n,) in metres: here of (patches, TERMS) coefficients."""

@@ -1,5 +1,6 @@
 """Cameras and noise models in files: each class gives its arrays, and is made of them again."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -18,22 +19,21 @@ KINDS: dict[str, type["Stored"]] = {}
 StoredT = TypeVar("StoredT", bound="Stored")
 
 
-class Stored:
+class Stored(ABC):
     """The base of cameras and noise models that files can hold."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         KINDS[cls.__name__] = cls
 
+    @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that :meth:`of_arrays` needs, by name. A subclass that does not write its own is read again as
-        its base."""
-        raise NotImplementedError
+        """All that :meth:`of_arrays` needs, by name. A subclass without its own is read again as its base."""
 
     @classmethod
+    @abstractmethod
     def of_arrays(cls: type[StoredT], file: "Arrays") -> StoredT:
         """The same again. Raises the errors of the class's constructor, and the file's for wrong arrays."""
-        raise NotImplementedError
 
 
 class Arrays:

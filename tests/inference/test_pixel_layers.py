@@ -117,31 +117,9 @@ def test_the_histogram_is_that_of_the_posterior(seed: int) -> None:
 
 
 @settings(max_examples=6)
-@given(
-    history=st.lists(
-        st.tuples(st.sampled_from(["add", "remove", "move", "infer", "look"]), st.integers(0, 5)), max_size=7
-    ),
-    final=st.permutations(range(6)).map(lambda order: order[:3]),
-)
+@given(history=scene.HISTORIES, final=scene.FINAL)
 def test_edits_are_exact(history: list[tuple[str, int]], final: list[int]) -> None:
-    m = MRFMap(scene.VOXEL, scene.NOISE)
-    for verb, number in history:
-        ids = list(m.keyframes)
-        if verb == "add" and len(ids) < 4:
-            add(m, number)
-        elif verb == "remove" and ids:
-            m.remove_keyframe(ids[number % len(ids)])
-        elif verb == "move" and ids:
-            m.move_keyframe(ids[number % len(ids)], scene.pose(*scene.PLACES[number]))
-        elif verb == "infer":
-            m.infer(sweeps=1)
-        elif verb == "look":
-            labels(m)
-    for id in list(m.keyframes):
-        m.remove_keyframe(id)
-    for number in final:
-        add(m, number)
-    m.infer()
+    m = scene.edited(history, final, look=labels, add=add)
     np.testing.assert_array_equal(labels(m), labels(build(sorted(final))))
 
 

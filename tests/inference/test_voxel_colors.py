@@ -73,34 +73,12 @@ def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float)
     np.testing.assert_allclose(got[:, 3], expected[:, 3], atol=count)
 
 
-steps = st.lists(
-    st.tuples(st.sampled_from(["add", "remove", "move", "infer", "look"]), st.integers(0, 5)), max_size=8
-)
-
-
 @settings(max_examples=8)
-@given(history=steps, final=st.permutations(range(6)).map(lambda order: order[:3]))
+@given(history=scene.HISTORIES, final=scene.FINAL)
 def test_any_history_ends_in_the_colours_of_the_final_set(
     history: list[tuple[str, int]], final: list[int]
 ) -> None:
-    m = MRFMap(scene.VOXEL, scene.NOISE)
-    for verb, number in history:
-        ids = list(m.keyframes)
-        if verb == "add" and len(ids) < 4:
-            scene.add(m, number)
-        elif verb == "remove" and ids:
-            m.remove_keyframe(ids[number % len(ids)])
-        elif verb == "move" and ids:
-            m.move_keyframe(ids[number % len(ids)], scene.pose(*scene.PLACES[number]))
-        elif verb == "infer":
-            m.infer(sweeps=1)
-        elif verb == "look":
-            m.colors(scene.probes()[:1])
-    for id in list(m.keyframes):
-        m.remove_keyframe(id)
-    for number in final:
-        scene.add(m, number)
-    m.infer()
+    m = scene.edited(history, final, look=lambda m: m.colors(scene.probes()[:1]))
     expected = scene.build(sorted(final)).colors(scene.probes())
     assert (expected[:, 3] > 0).sum() > 500
     np.testing.assert_array_equal(m.colors(scene.probes()), expected)

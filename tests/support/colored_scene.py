@@ -1,6 +1,9 @@
 """A red thing in front of a blue wall, in depth and colour: what tests of colours look at."""
 
+from collections.abc import Callable
+
 import numpy as np
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -47,6 +50,43 @@ def build(numbers: list[int]) -> MRFMap:
     """A map of some of the views, inferred."""
     m = MRFMap(VOXEL, NOISE)
     for number in numbers:
+        add(m, number)
+    m.infer()
+    return m
+
+
+HISTORIES = st.lists(
+    st.tuples(st.sampled_from(["add", "remove", "move", "infer", "look"]), st.integers(0, 5)), max_size=8
+)
+"""What was done to a map, each with a number that chooses a view."""
+
+FINAL = st.permutations(range(6)).map(lambda order: order[:3])
+"""The views of which a map is in the end."""
+
+
+def edited(
+    history: list[tuple[str, int]],
+    final: list[int],
+    look: Callable[[MRFMap], object],
+    add: Callable[[MRFMap, int], int] = add,
+) -> MRFMap:
+    """A map with a history, which ends with the ``final`` views alone, inferred; ``look`` reads the layer."""
+    m = MRFMap(VOXEL, NOISE)
+    for verb, number in history:
+        ids = list(m.keyframes)
+        if verb == "add" and len(ids) < 4:
+            add(m, number)
+        elif verb == "remove" and ids:
+            m.remove_keyframe(ids[number % len(ids)])
+        elif verb == "move" and ids:
+            m.move_keyframe(ids[number % len(ids)], pose(*PLACES[number]))
+        elif verb == "infer":
+            m.infer(sweeps=1)
+        elif verb == "look":
+            look(m)
+    for id in list(m.keyframes):
+        m.remove_keyframe(id)
+    for number in final:
         add(m, number)
     m.infer()
     return m
