@@ -104,8 +104,6 @@ def sightings(
     probabilities = ti.ndarray(ti.f32, len(of_voxels))
     probabilities.from_numpy(of_voxels)
     passed, confirmed = (ti.ndarray(ti.i32, len(of_voxels)) for _ in range(2))
-    passed.fill(0)
-    confirmed.fill(0)
 
     corners = bricks if len(bricks) else np.zeros((1, 3), np.int32)
     edge = m.voxel_size * BRICK

@@ -196,7 +196,6 @@ def depth_graph(
     if grid.cells:
         _write_priors(prior, rays, edges - grid.cells, cells, table)
     degrees, hits = ti.ndarray(ti.i32, max(1, grid.cells)), ti.ndarray(ti.i32, max(1, beams))
-    degrees.fill(0)
     hits.fill(1)
     if edges:
         count_degrees(cells, edges, degrees)

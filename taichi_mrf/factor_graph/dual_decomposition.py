@@ -162,7 +162,6 @@ class DualDecomposition:
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config
         self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
-        self.multipliers.fill(0)
         beams, cells = graph.beams, graph.grid.cells
         self.awake, self.firsts = np.ones(beams, np.int32), np.zeros(beams, np.int32)
         self.values = np.zeros(beams, np.int64)
@@ -291,7 +290,6 @@ class BlockAscent:
         self.workers = beam_workers(graph)
         self.scratch = ti.ndarray(ti.i32, self.workers.number * graph.longest)
         self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
-        self.multipliers.fill(0)
         cells = graph.grid.cells
         self.degrees = np.maximum(graph.degrees.to_numpy(), 1).astype(np.int64)
         # On the device: what a kernel leaves untouched of a NumPy array is undefined on Vulkan.

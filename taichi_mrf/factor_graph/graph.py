@@ -222,7 +222,6 @@ def build_graph(beams: Beams, cell_size: float, memory_limit_gb: float = 0.0) ->
     check_capacity(len(beams), grid.cells, edges, memory_limit_gb)
     begin_array = _array(begins.astype(np.int32))
     cells, degrees = ti.ndarray(ti.i32, max(1, edges)), ti.ndarray(ti.i32, grid.cells)
-    degrees.fill(0)
     if len(beams):
         write_cells(ray_array, shape, begin_array, cells)
         count_degrees(cells, edges, degrees)

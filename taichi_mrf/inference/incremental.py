@@ -27,7 +27,7 @@ def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
     """The share of the voxels seen by a keyframe whose marginals have moved since its last sweep; 1 if it was
     never swept. A marginal counts each time that it moves by over 0.01, a brick as its voxels at most."""
     visible = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
-    seen_count = change_count_seen_by(keyframe, visible)
+    seen_count = keyframe.change_count_at_last_sweep
     if seen_count is None or keyframe.messages is None:
         return 1.0
     if len(seen_count) == 0:
@@ -36,15 +36,13 @@ def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
     return float(moved.sum()) / (len(moved) * VOXELS)
 
 
-def change_count_seen_by(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
-    """The change counts at a keyframe's last sweep, for a newer list of its bricks. A brick that was not on
-    the old list counts as changed in all voxels."""
-    if visible is keyframe.visible or keyframe.change_count_at_last_sweep is None:
-        return keyframe.change_count_at_last_sweep
-    place = places_of(keyframe.visible, visible)
-    seen_count = np.full(len(place), -VOXELS, np.int64)
-    seen_count[place >= 0] = keyframe.change_count_at_last_sweep[place[place >= 0]]
-    return seen_count
+def change_count_of(
+    visible: VisibleBricks, old: VisibleBricks, change_count: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The change counts at a keyframe's last sweep for a newer list of its bricks, from those for the ``old``
+    one. A brick that was not on that counts as changed in all voxels."""
+    place = places_of(old, visible)
+    return np.where(place >= 0, np.append(change_count, 0)[place], -VOXELS)
 
 
 class IncrementalInference:

@@ -281,8 +281,9 @@ class Keyframe:
 
     ``stamp_s`` is when it was taken, in seconds. ``messages`` is (bricks * 512) log-odds, in the order of
     ``visible``. ``revision`` is that of the beliefs right after its last sweep, and
-    ``change_count_at_last_sweep`` (bricks) how often marginals of each brick had changed by then.
-    ``pending_visible`` is what the keyframe sees now, if its messages are still those of ``visible``.
+    ``pending_visible`` what the keyframe sees now, if its messages are still those of ``visible``.
+    ``change_count_at_last_sweep`` (bricks that it sees now) is how often marginals of each had changed by
+    its last sweep.
     ``no_returns`` are the rays of pixels that got no return, if they count.
     """
 

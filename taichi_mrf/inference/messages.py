@@ -40,10 +40,9 @@ def withdraw_messages(
     n = len(visible.slots)
     if n == 0:
         return np.zeros(0, np.int32)
-    moved = ti.ndarray(ti.i32, n)
-    moved.fill(0)
+    moved = np.zeros(n, np.int32)
     leave.withdraw(visible.slots, belief, messages, moved, strip_length())
-    return moved.to_numpy()
+    return moved
 
 
 def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
@@ -68,7 +67,6 @@ def count_observations(
     row_of = np.full(pool.capacity, -1, np.int32)
     row_of[slots] = np.arange(len(slots))
     counts = ti.ndarray(ti.i32, len(slots) * VOXELS)
-    counts.fill(0)
     for visible, messages in keyframes:
         rows = row_of[visible.slots]
         rows[pool.identity[visible.slots] != visible.identity] = -1  # the slot has changed hands

@@ -156,7 +156,6 @@ class VoxelSums:
         cells = max(1, pool.capacity) * VOXELS
         check_memory(float(8 * words + 4) * cells, f"the {what} of {cells / 1e6:.3g} million voxels")
         self.sums = ti.ndarray(ti.i64, cells * words)
-        self.sums.fill(0)
 
     @property
     def nbytes(self) -> int:

@@ -28,6 +28,8 @@ has gone is forgotten.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference.brick_sums import VOTES
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
@@ -35,6 +37,7 @@ from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.resident import zeros
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Struct, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
@@ -93,9 +96,7 @@ def count_votes(
     order counts, and old scores fade. ``between`` is called after each keyframe."""
     learnt = pool.prior_log_odds + volume.min_evidence
     index = WindowIndex()
-    counts, ends = ti.ndarray(ti.i64, pool.belief.shape), ti.ndarray(ti.i32, pool.belief.shape)
-    counts.fill(0)
-    ends.fill(0)
+    counts, ends = (zeros(kind, pool.belief.shape[0]) for kind in (np.int64, np.int32))
     free_logs, vote = FreeLogs.of(pool, model), _Vote(pool.belief, learnt, counts, ends)
     for keyframe, visible in keyframes:
         if len(visible.slots) > 0:
@@ -114,9 +115,7 @@ def count_votes(
 
 def no_votes(voxels: int) -> "ti.Ndarray":
     """Votes and scores of so many voxels, all 0."""
-    votes = ti.ndarray(ti.i32, VOTES * voxels)
-    votes.fill(0)
-    return votes
+    return ti.ndarray(ti.i32, VOTES * voxels)
 
 
 @ti.dataclass
@@ -241,6 +240,13 @@ def set_votes(slots: I32Array, those: I32Array, votes: I32Array) -> None:
     """Set the votes and scores in the bricks in ``slots`` (n) to ``those`` (n * 512 * VOTES)."""
     for i in range(slots.shape[0] * VOXELS * VOTES):
         votes[slots[i // (VOXELS * VOTES)] * (VOXELS * VOTES) + i % (VOXELS * VOTES)] = those[i]
+
+
+@kernel
+def clear_votes(slots: I32Array, votes: I32Array) -> None:
+    """Set the votes and scores in the bricks in ``slots`` (n) to 0."""
+    for i in range(slots.shape[0] * VOXELS * VOTES):
+        votes[slots[i // (VOXELS * VOTES)] * (VOXELS * VOTES) + i % (VOXELS * VOTES)] = 0
 
 
 @kernel

@@ -64,14 +64,14 @@ def call_matter(
     (n * VOTES) say that there is matter. An occupied voxel gets those of its score, one in doubt that was
     free the prior, which is unknown. ``bricks`` (capacity, 3) are those of the map, in ``slots`` (m)."""
     occupied = max(0.0, prior + min_evidence)
+    slots = slots[np.argsort(grid_keys(bricks[slots]))]
     found = np.zeros(len(slots), np.int32)
     _find_doubted(slots, votes, log_odds, occupied, found)
     doubted = slots[np.flatnonzero(found)]
     if not len(doubted):
         return
-    order = np.argsort(grid_keys(bricks[slots]))
-    around = rows_around(bricks[doubted], grid_keys(bricks[slots[order]]))
-    around = np.where(around >= 0, slots[order][around], -1).astype(np.int32)
+    around = rows_around(bricks[doubted], grid_keys(bricks[slots]))
+    around = np.where(around >= 0, slots[around], -1).astype(np.int32)
     verdicts = ti.ndarray(ti.i32, log_odds.shape)
     verdicts.fill(_FREE)
     voxels = _Voxels(around.reshape(-1), votes, log_odds, occupied, *thin(voxel_size))

@@ -30,7 +30,8 @@ def resident(values: NDArray[Any]) -> Resident:
 
 
 def zeros(dtype: DTypeLike, length: int) -> Resident:
-    """An array (length) of zeros for kernels to write to; on a CPU it is NumPy's, which is made sooner."""
+    """An array (length) of zeros for kernels to write to, as each new one of Taichi's is; on a CPU it is
+    NumPy's, which is made sooner."""
     if runtime.active() == "cpu":
         return np.zeros(length, dtype)
     return ti.ndarray(compiler.data_type(np.dtype(dtype)), length)

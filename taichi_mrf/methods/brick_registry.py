@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.inference.keyframe import Footprint, VisibleBricks
+from taichi_mrf.inference.keyframe import Cells, Footprint, VisibleBricks
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.voxels.layout import BRICK, CHUNK, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
@@ -20,7 +20,8 @@ from taichi_mrf.voxels.topology import Topology
 Bricks = NDArray[np.int32]
 
 REMEMBERED = 64
-"""Changes of the set of bricks that are remembered. Lists of visible bricks older than that are rebuilt."""
+"""Changes of the set of bricks that are remembered, with the bricks' slots, -1 for those that are gone. Lists
+of visible bricks older than that are rebuilt."""
 
 
 class BrickRegistry:
@@ -29,7 +30,7 @@ class BrickRegistry:
     def __init__(self, topology: Topology, pool: BrickPool, voxel_size: float) -> None:
         self.topology, self.pool, self.voxel_size = topology, pool, voxel_size
         self.version = 0
-        self._changes: deque[Bricks] = deque(maxlen=REMEMBERED)
+        self._changes: deque[tuple[Bricks, NDArray[np.int32]]] = deque(maxlen=REMEMBERED)
         self.frozen_crossed: Bricks = np.zeros((0, 3), np.int32)
         self._frozen_keys = np.zeros(0, np.int64)
         self.before_claim: Callable[[Bricks], None] | None = None  # with the bricks (n, 3) to be crossed
@@ -80,7 +81,7 @@ class BrickRegistry:
         """Allocate bricks (n, 3) at the prior, without owners; returns their slots (n,)."""
         slots = self.pool.allocate(bricks)
         self.topology.insert(bricks, slots)
-        self._note_change(bricks)
+        self._note_change(bricks, slots)
         return slots
 
     def disclaim(self, footprint: Footprint) -> None:
@@ -138,30 +139,51 @@ class BrickRegistry:
         steps = self.version - old.version
         if steps > len(self._changes):
             return self.visible(footprint)
-        for bricks in list(self._changes)[len(self._changes) - steps :]:
+        changes = []
+        for bricks, slots in list(self._changes)[len(self._changes) - steps :]:
             cells = footprint.window.cells_of(bricks)
-            place = np.minimum(np.searchsorted(footprint.crossed, cells), len(footprint.crossed) - 1)
-            if len(footprint.crossed) and (footprint.crossed[place] == cells).any():
-                return self.visible(footprint)
-        old.version = self.version
-        return old
+            place = np.searchsorted(footprint.crossed, cells)
+            crossed = (np.append(footprint.crossed, -1)[place] == cells) & (cells >= 0)
+            changes.append((cells[crossed], slots[crossed]))
+        if not any(len(cells) for cells, _ in changes):
+            old.version = self.version
+            return old
+        # The last change of a brick comes first, and is the one that np.unique takes.
+        cells, slots = (np.concatenate(each)[::-1] for each in zip(*changes, strict=True))
+        cells, last = np.unique(cells, return_index=True)
+        return self._list(*_merged(old.cells, old.slots, cells, slots[last]))
 
     def _release(self, slots: NDArray[np.int32]) -> None:
         """Release bricks, which no keyframe owns any more."""
         bricks = self.pool.bricks[slots]
         self.topology.erase(bricks)
         self.pool.release(slots)
-        self._note_change(bricks)
+        self._note_change(bricks, np.full(len(bricks), -1, np.int32))
         for forget in self.on_release:
             forget(bricks)
 
-    def _note_change(self, bricks: Bricks) -> None:
+    def _note_change(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
         self.version += 1
-        self._changes.append(bricks)
+        self._changes.append((bricks, slots))
 
     def visible(self, footprint: Footprint) -> VisibleBricks:
         """The allocated bricks among those that a keyframe's rays cross."""
         slots = self.topology.slots(footprint.window.bricks_of(footprint.crossed))
         exist = slots >= 0
-        slots = slots[exist]
-        return VisibleBricks(footprint.crossed[exist], slots, self.pool.identity[slots], self.version)
+        return self._list(footprint.crossed[exist], slots[exist])
+
+    def _list(self, cells: Cells, slots: NDArray[np.int32]) -> VisibleBricks:
+        return VisibleBricks(cells, slots, self.pool.identity[slots], self.version)
+
+
+def _merged(
+    cells: Cells, slots: NDArray[np.int32], other_cells: Cells, other_slots: NDArray[np.int32]
+) -> tuple[Cells, NDArray[np.int32]]:
+    """A list of bricks, ascending cells with their slots, in which other ones have the slots that are given:
+    -1 for a brick that is gone."""
+    place = np.searchsorted(cells, other_cells)
+    listed = np.append(cells, -1)[place] == other_cells
+    cells, slots = np.delete(cells, place[listed]), np.delete(slots, place[listed])
+    exist = other_slots >= 0
+    place = np.searchsorted(cells, other_cells[exist])
+    return np.insert(cells, place, other_cells[exist]), np.insert(slots, place, other_slots[exist])

@@ -22,6 +22,7 @@ from taichi_mrf.kernels.types import (
     DVec3,
     F32Array,
     F32Array2,
+    I32Array2,
     IVec3,
     Template,
     Vec3,
@@ -60,31 +61,30 @@ class PointsInPlace(Bundle):
     voxel_size: F64
 
     lowest: DVec3
-    """The centre of the window's first voxel, in voxels."""
+    """The window's first voxel."""
 
     @ti.func
     def split(self, i: I32):
         """The voxel of the window whose centre comes before point i along each axis, and how far the point is
-        beyond it, in voxels."""
-        place = DVec3(self.points[i, 0], self.points[i, 1], self.points[i, 2]) / self.voxel_size - self.lowest
-        place = ti.min(ti.max(place, -_FARTHEST), _FARTHEST)
+        beyond it, in voxels. That follows from the point alone, wherever the window begins."""
+        place = DVec3(self.points[i, 0], self.points[i, 1], self.points[i, 2]) / self.voxel_size - 0.5
         whole = ti.floor(place)
-        return ti.cast(whole, ti.i32), ti.cast(place - whole, ti.f32)
+        voxel = ti.min(ti.max(whole - self.lowest, -_FARTHEST), _FARTHEST)
+        return ti.cast(voxel, ti.i32), ti.cast(place - whole, ti.f32)
 
 
 @dataclass(frozen=True)
 class PointsMoved(Bundle):
-    """Points (N, 3) in voxels from the centre of the window's first voxel: devices that may lack float64."""
+    """What PointsInPlace.split says of each point, (N, 3) each: devices that may lack float64."""
 
-    points: F32Array2
+    voxels: I32Array2
+    shares: F32Array2
 
     @ti.func
     def split(self, i: I32):
         """As PointsInPlace.split."""
-        place = Vec3(self.points[i, 0], self.points[i, 1], self.points[i, 2])
-        place = ti.min(ti.max(place, -_FARTHEST), _FARTHEST)
-        whole = ti.floor(place)
-        return ti.cast(whole, ti.i32), place - whole
+        voxel = IVec3(self.voxels[i, 0], self.voxels[i, 1], self.voxels[i, 2])
+        return voxel, Vec3(self.shares[i, 0], self.shares[i, 1], self.shares[i, 2])
 
 
 FieldPoints: TypeAlias = PointsInPlace | PointsMoved
@@ -92,10 +92,12 @@ FieldPoints: TypeAlias = PointsInPlace | PointsMoved
 
 def field_points(points: Any, voxel_size: float, lowest_voxel: NDArray[np.int64]) -> FieldPoints:
     """Points (N, 3) in metres as kernels take them; ``lowest_voxel`` (3,) is the window's first."""
-    lowest = lowest_voxel + 0.5
     if runtime.active() == "vulkan":
-        return PointsMoved((np.asarray(points, np.float64) / voxel_size - lowest).astype(np.float32))
-    return PointsInPlace(points, voxel_size, ti.Vector(lowest.tolist(), ti.f64))
+        place = np.asarray(points, np.float64) / voxel_size - 0.5
+        whole = np.floor(place)
+        voxels = np.clip(whole - lowest_voxel, -_FARTHEST, _FARTHEST).astype(np.int32)
+        return PointsMoved(voxels, (place - whole).astype(np.float32))
+    return PointsInPlace(points, voxel_size, ti.Vector(lowest_voxel.tolist(), ti.f64))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ with those that it kept, and follows what differs along z, then y, then x, each 
 sums did change.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,8 +25,9 @@ from taichi_mrf.queries.distance_grid import (
     SpaceRules,
     classify_bricks,
     copy_all,
-    fill_rows,
     keep_classes,
+    set_codes,
+    take_slots,
 )
 from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
 from taichi_mrf.queries.free import refused
@@ -43,7 +46,7 @@ _LEAST_CAPACITY = 256
 BrickBox = tuple[NDArray[np.int64], NDArray[np.int64]]
 """The lowest brick of a box and the highest, (3,) each."""
 
-Cells = NDArray[np.int64]
+Cells = NDArray[np.int32]
 """(n,) numbers of bricks in the window."""
 
 
@@ -87,14 +90,14 @@ class DistanceBricks:
         self._cover(bricks)
         cells = self._cells(bricks)
         view = m.view
-        found, changed = ti.ndarray(ti.i32, len(cells) * COLUMNS), _zeros(len(cells))
+        found, changed = ti.ndarray(ti.i32, len(cells) * COLUMNS), np.zeros(len(cells), np.int32)
         classify_bricks(
             view.pool.belief if most is None else refused(m, most),
-            sources, cells.astype(np.int32), view.pool.prior_log_odds,
+            sources, cells, view.pool.prior_log_odds,
             view.volume.min_evidence, self.rules.unknown == "occupied", self.rules.unknown == "unknown",
             self.grid, found, changed,
         )  # fmt: skip
-        rows = np.flatnonzero(changed.to_numpy()).astype(np.int32)
+        rows = np.flatnonzero(changed).astype(np.int32)
         voxels = self._spread(cells[rows], rows, found) if len(rows) else 0
         self._known = bricks[sources != GONE]
         runtime.settle()
@@ -113,7 +116,7 @@ class DistanceBricks:
         if within is not None:
             inside = ((bricks >= within[0]) & (bricks <= within[1])).all(axis=1)
             bricks, sources = bricks[inside], sources[inside]
-        gone = self._known[~np.isin(grid_keys(self._known), grid_keys(bricks))]
+        gone = self._known[~np.isin(grid_keys(self._known), grid_keys(bricks), assume_unique=True)]
         gone_sources = np.full(len(gone), GONE, np.int32)
         return np.concatenate([bricks, gone]), np.concatenate([sources, gone_sources])
 
@@ -124,20 +127,20 @@ class DistanceBricks:
         stretch = range(-self.rules.reach_bricks, self.rules.reach_bricks + 1)
         column = self._beside(cells, 2, stretch)
         made.append(self._make(column))
-        changed = _zeros(len(column))
-        along_z(column.astype(np.int32), self.grid, self._first, changed)
-        plane = self._beside(column[changed.to_numpy() > 0], 1, stretch)
+        changed = np.zeros(len(column), np.int32)
+        along_z(column, self.grid, self._first, changed)
+        plane = self._beside(column[changed > 0], 1, stretch)
         made.append(self._make(plane))
         if len(plane):
-            changed = _zeros(len(plane))
-            along_y(plane.astype(np.int32), self.grid, self._first, self._second, changed)
-            plane = plane[changed.to_numpy() > 0]
-        block = np.unique(np.concatenate([self._beside(plane, 0, stretch), cells, *made]))
+            changed = np.zeros(len(plane), np.int32)
+            along_y(plane, self.grid, self._first, self._second, changed)
+            plane = plane[changed > 0]
+        block = _union([self._beside(plane, 0, stretch), cells, *made])
         made.append(self._make(block))
-        changed, counts = _zeros(len(block)), _zeros(len(block))
-        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, changed, counts)
-        self._join(np.concatenate([block[changed.to_numpy() > 0], *made]))
-        return int(counts.to_numpy().sum())
+        changed, counts = np.zeros((2, len(block)), np.int32)
+        along_x(block, self.grid, self._second, self._metres, self.values, changed, counts)
+        self._join(np.concatenate([block[changed > 0], *made]))
+        return int(counts.sum())
 
     def _join(self, cells: Cells) -> None:
         """Let bricks before some bricks know of their distances, and give back those that need no slots."""
@@ -146,15 +149,15 @@ class DistanceBricks:
         for axis in range(3):
             cells = self._beside(cells, axis, (-1, 0))
         self._make(cells)
-        far, outside = _zeros(len(cells)), _zeros(len(cells))
+        far, outside = np.zeros((2, len(cells)), np.int32)
         far_m, outside_m = float(self.rules.metres[-1]), self.rules.outside_m
-        join_bricks(cells.astype(np.int32), self.grid, self.values, far_m, outside_m, far, outside)
-        all_far, all_outside = far.to_numpy() == SAMPLES, outside.to_numpy() == SAMPLES
-        self._drop(cells[all_far], FAR)
-        self._drop(cells[all_outside & ~all_far], OUTSIDE)
+        join_bricks(cells, self.grid, self.values, far_m, outside_m, far, outside)
+        codes = np.where(far == SAMPLES, FAR, np.where(outside == SAMPLES, OUTSIDE, 0)).astype(np.int32)
+        self._drop(cells[codes < 0], codes[codes < 0])
 
     def _cells(self, bricks: Bricks) -> Cells:
-        return np.ravel_multi_index(tuple((bricks - self.lowest).T), self._codes.shape)
+        cells = np.ravel_multi_index(tuple((bricks - self.lowest).T), self._codes.shape)
+        return np.asarray(cells, np.int32)
 
     def _slots(self, cells: Cells) -> NDArray[np.int32]:
         return self._codes.reshape(-1)[cells]
@@ -162,8 +165,8 @@ class DistanceBricks:
     def _beside(self, cells: Cells, axis: int, steps: "range | tuple[int, ...]") -> Cells:
         """Some bricks with those so many steps beside them along an axis, ascending. The window's margin
         holds them all."""
-        step = int(np.prod(self._codes.shape[axis + 1 :]))
-        return np.unique((cells[:, None] + np.array(steps) * step).reshape(-1))
+        across = int(np.prod(self._codes.shape[axis + 1 :]))
+        return _union([cells + np.int32(step * across) for step in steps])
 
     def _cover(self, bricks: Bricks) -> None:
         """Let the window hold some bricks and all that their states can change. Raises CapacityError."""
@@ -186,31 +189,24 @@ class DistanceBricks:
     def _make(self, cells: Cells) -> Cells:
         """Give slots to those of some bricks that have none; returns these. Raises CapacityError."""
         codes = self._slots(cells)
-        new, codes = cells[codes < 0], codes[codes < 0]
+        new = cells[codes < 0]
         if not len(new):
             return new
         if len(new) > len(self._free):
             self._grow(self._capacity + len(new) - len(self._free))
-        slots = np.array([self._free.pop() for _ in new], np.int32)
-        outside = codes == OUTSIDE
-        squares = np.where(outside, self.rules.outside_square, self.rules.beyond).astype(np.int32)
-        fill_rows(
-            self.classes, slots, COLUMNS, np.where(outside, self.rules.outside_class, 0).astype(np.int32)
-        )
-        fill_rows(self._first, slots, VOXELS, squares)
-        fill_rows(self._second, slots, VOXELS, squares)
-        metres = np.where(outside, self.rules.outside_m, self.rules.metres[-1]).astype(np.float32)
-        fill_rows(self.values, slots, SAMPLES, metres)
+        slots = np.array(self._free[: -len(new) - 1 : -1], np.int32)
+        del self._free[-len(new) :]
+        far_m, outside_m = float(self.rules.metres[-1]), self.rules.outside_m
+        take_slots(new, slots, self.grid, self._first, self._second, self.values, far_m, outside_m)
         self._codes.reshape(-1)[new] = slots
-        self.grid = self._grid()
         return new
 
-    def _drop(self, cells: Cells, code: int) -> None:
+    def _drop(self, cells: Cells, codes: NDArray[np.int32]) -> None:
         """Give back the slots of bricks whose distances are all the same."""
         if len(cells):
             self._free += self._slots(cells).tolist()
-            self._codes.reshape(-1)[cells] = code
-            self.grid = self._grid()
+            set_codes(cells, codes, self.grid)
+            self._codes.reshape(-1)[cells] = codes
 
     def _grow(self, needed: int) -> None:
         if needed > _MOST_BRICKS:
@@ -233,19 +229,25 @@ class DistanceBricks:
             copy_all(old, new, self._capacity * size)
             runtime.settle()
             setattr(self, name, new)
+        self.grid = replace(self.grid, classes=self.classes)
         self._free += range(capacity - 1, self._capacity - 1, -1)
         self._capacity = capacity
 
     def _grid(self) -> FieldGrid:
         runtime.settle()  # before the old index is dropped
         shape = ti.Vector(list(self._codes.shape), ti.i32)
-        index = resident(self._codes.reshape(-1))
+        index = resident(self._codes.reshape(-1))  # on a CPU the codes themselves
         rules = self.rules
         return FieldGrid(shape, index, self.classes, rules.outside_class, rules.reach, rules.outside_square)
 
 
-def _zeros(length: int) -> "ti.Ndarray":
-    """Counters that kernels write here and there."""
-    array = ti.ndarray(ti.i32, length)
-    array.fill(0)
-    return array
+def _union(parts: list[Cells]) -> Cells:
+    """Each of some bricks once, ascending. They are close together, so marks are sooner made than a sort."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return np.zeros(0, np.int32)
+    first, last = min(int(part.min()) for part in parts), max(int(part.max()) for part in parts)
+    marks = np.zeros(last - first + 1, bool)
+    for part in parts:
+        marks[part - first] = True
+    return np.flatnonzero(marks).astype(np.int32) + np.int32(first)

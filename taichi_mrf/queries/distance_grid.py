@@ -204,11 +204,33 @@ def keep_classes(found: I32Array, rows: I32Array, slots: I32Array, classes: I32A
 
 
 @kernel
-def fill_rows(channel: AnyArray, slots: I32Array, size: I32, values: AnyArray) -> None:
-    """Set all of the ``size`` entries of the bricks in ``slots`` (k) of a ``channel`` to the brick's one of
-    ``values`` (k)."""
-    for part in range(slots.shape[0] * size):
-        channel[slots[part // size] * size + part % size] = values[part // size]
+def take_slots(
+    cells: I32Array, slots: I32Array, grid: FieldGrid, first: I32Array, second: I32Array, values: F32Array,
+    far_m: F32, outside_m: F32,
+) -> None:  # fmt: skip
+    """Give bricks of the window, numbers (n), their ``slots`` (n), and say there what they were without one:
+    OUTSIDE, or FAR. ``first`` and ``second`` (slots * 512) are squared distances, ``values`` (slots * 729)
+    metres."""
+    for part in range(cells.shape[0] * SAMPLES):
+        row, k = part // SAMPLES, part % SAMPLES
+        slot, column, square, metres = slots[row], 0, (grid.reach + 1) * (grid.reach + 1), far_m
+        if grid.index[cells[row]] == OUTSIDE:
+            column, square, metres = grid.outside_class, grid.outside, outside_m
+        values[slot * SAMPLES + k] = metres
+        if k < VOXELS:
+            first[slot * VOXELS + k] = square
+            second[slot * VOXELS + k] = square
+        if k < COLUMNS:
+            grid.classes[slot * COLUMNS + k] = column
+    for row in range(cells.shape[0]):
+        grid.index[cells[row]] = slots[row]
+
+
+@kernel
+def set_codes(cells: I32Array, codes: I32Array, grid: FieldGrid) -> None:
+    """Say of bricks of the window, numbers (n), that they have no slots: ``codes`` (n), FAR or OUTSIDE."""
+    for row in range(cells.shape[0]):
+        grid.index[cells[row]] = codes[row]
 
 
 @kernel

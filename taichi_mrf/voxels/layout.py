@@ -58,12 +58,21 @@ def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.i
 def rows_around(cells: NDArray[np.int32], keys: NDArray[np.int64], reach: int = 1) -> NDArray[np.int32]:
     """Index among ascending ``keys`` (:func:`grid_keys`) of cells (n, 3) and of those up to ``reach`` away
     along each axis: (n, (2 reach + 1)^3), x slowest, -1 where there is none."""
-    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    wanted = grid_keys((cells[:, None] + steps).reshape(-1, 3))
+    side = 2 * reach + 1
+    rows = np.full((len(cells), side**3), -1, np.int32)
     if not len(keys):
-        return np.full((len(cells), len(steps)), -1, np.int32)
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[rows] == wanted, rows, -1).astype(np.int32).reshape(-1, len(steps))
+        return rows
+    lowest = grid_keys(cells - reach)
+    for column in range(side * side):
+        # Ascending keys have the cells of a column in a row: only the first one is searched for.
+        wanted = lowest + ((column // side << 42) + (column % side << 21))
+        place = np.searchsorted(keys, wanted)
+        for k in range(side):
+            here = np.minimum(place, len(keys) - 1)
+            found = keys[here] == wanted + k
+            rows[found, column * side + k] = here[found]
+            place = place + found
+    return rows
 
 
 def by_chunk(bricks: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int64]]]:

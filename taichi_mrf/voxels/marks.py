@@ -40,7 +40,6 @@ def no_marks(window: Window) -> ti.ndarray:
         raise CapacityError(f"{what} is too large to mark its voxels one by one; choose larger voxels")
     check_memory(window.cells * VOXELS / 8, what)
     marks = ti.ndarray(ti.i32, window.cells * WORDS)
-    marks.fill(0)
     return marks
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
@@ -163,7 +163,7 @@ class BrickPool:
         self.restarts += 1
         self._touched[:] = True
         if self.evidence is not None:
-            self.total.copy_from(self.evidence)
+            _copy(self.evidence, self.total, self.capacity, strip_length())
         else:
             self.total.fill(self.prior_log_odds)
 
@@ -202,7 +202,7 @@ class BrickPool:
         self.revision += 1
         self.restarts += 1
         self._touched[:] = True
-        self.total.copy_from(snapshot.total)
+        _copy(snapshot.total, self.total, snapshot.total.shape[0] // VOXELS, strip_length())
         runtime.settle()  # before the snapshot is dropped
 
     @contextmanager
@@ -302,21 +302,20 @@ class BrickPool:
 
 def copied(channel: "ti.Ndarray") -> "ti.Ndarray":
     """A copy of a channel (capacity * 512)."""
-    copy = ti.ndarray(ti.f32, channel.shape)
-    copy.copy_from(channel)
-    return copy
+    bricks = channel.shape[0] // VOXELS
+    return grown(channel, bricks, bricks)
 
 
 def grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
     """A channel with room for ``capacity`` bricks, which holds the voxels of the old one."""
-    new = ti.ndarray(ti.f32, capacity * VOXELS)
+    new = ti.ndarray(old.dtype, capacity * VOXELS)
     _copy(old, new, old_capacity, strip_length())
     runtime.settle()
     return new
 
 
 @ti.kernel
-def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
+def _copy(source: AnyArray, target: AnyArray, bricks: I32, strip: Template):
     """Copy the voxels of the first ``bricks`` bricks. ``source`` and ``target`` are channels (capacity *
     512); ``strip`` here and below: voxels/numbering.py."""
     for part in range(bricks * (VOXELS // strip)):

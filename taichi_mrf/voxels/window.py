@@ -111,7 +111,6 @@ class WindowIndex:
         self.bricks = ti.ndarray(ti.i32, cells)
         self.bricks.fill(-1)
         self.chunks = ti.ndarray(ti.i32, max(1, cells // CHUNK_BRICKS))
-        self.chunks.fill(0)
 
     def fill(self, window: Window, cells: Resident, slots: Resident) -> None:
         """Enter bricks: ``slots[i]`` at cell ``cells[i]`` of the window. NumPy or Taichi arrays (n); there

@@ -1,15 +1,12 @@
 """Incremental inference: who has heard something new, and what comes of sweeping only those."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.inference.incremental import change_count_seen_by, moved_share
+from taichi_mrf.inference.incremental import change_count_of, moved_share
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import places_of
@@ -201,11 +198,9 @@ def test_a_brick_that_is_new_to_a_list_counts_as_changed_in_all_voxels() -> None
     old, newer = listed([2, 5, 9], [20, 50, 90]), listed([1, 2, 5, 9, 11], [10, 20, 51, 90, 110])
     assert places_of(old, newer).tolist() == [-1, 0, -1, 2, -1]
     assert places_of(listed([], []), newer).tolist() == [-1] * 5
-    keyframe: Any = SimpleNamespace(visible=old, change_count_at_last_sweep=np.array([7, 8, 9]))
-    seen = change_count_seen_by(keyframe, newer)
-    assert seen is not None
+    seen = change_count_of(newer, old, np.array([7, 8, 9]))
     assert seen.tolist() == [-VOXELS, 7, -VOXELS, 9, -VOXELS]
-    assert change_count_seen_by(keyframe, old) is keyframe.change_count_at_last_sweep
+    assert change_count_of(old, listed([], []), np.array([], np.int64)).tolist() == [-VOXELS] * 3
 
 
 def test_without_a_tolerance_all_sweeps_are_made_even_if_nothing_moves_any_more() -> None:

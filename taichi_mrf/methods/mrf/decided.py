@@ -24,7 +24,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.calls import calls_of
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import PoolSnapshot, copied
+from taichi_mrf.voxels.pool import PoolSnapshot, copied, grown
 
 if TYPE_CHECKING:
     from taichi_mrf.inference import dated, surface_votes, thin_matter
@@ -138,26 +138,29 @@ class Decisions:
     def _add(self, keyframes: Sequence[Keyframe], between: Callable[[], object]) -> None:
         """Add the votes of some keyframes' rays. Only the bricks that they see are looked at."""
         lists = [self._registry.visible(keyframe.footprint) for keyframe in keyframes]
-        slots = np.unique(np.concatenate([visible.slots for visible in lists]))
+        seen = np.zeros(self._registry.pool.capacity, bool)
+        for visible in lists:
+            seen[visible.slots] = True
+        slots = np.flatnonzero(seen).astype(np.int32)
         part = self._registry.pool.part(slots)
         places = [np.searchsorted(slots, visible.slots).astype(np.int32) for visible in lists]
-        seen = [replace(visible, slots=at, arrays=None) for visible, at in zip(lists, places, strict=True)]
+        there = [replace(visible, slots=at, arrays=None) for visible, at in zip(lists, places, strict=True)]
         votes = surface_votes.no_votes(part.belief.shape[0])
         surface_votes.move_votes(slots, self._votes, votes, 0)
         surface_votes.count_votes(
-            zip(keyframes, seen, strict=True), part, self._sweeper.model(), self._sweeper.volume, votes,
+            zip(keyframes, there, strict=True), part, self._sweeper.model(), self._sweeper.volume, votes,
             self._changing, between,
         )  # fmt: skip
         surface_votes.move_votes(slots, self._votes, votes, 1)
 
     def _follow_bricks(self) -> None:
         """Forget the votes of bricks that are gone, and make room for new ones."""
-        pool = self._registry.pool
-        before, old = self._identity, self._votes
+        pool, before = self._registry.pool, self._identity
+        held, needed = self.nbytes // (4 * VOTES * VOXELS), pool.belief.shape[0] // VOXELS
+        if held < needed:
+            self._votes = grown(self._votes, VOTES * held, VOTES * needed)
         if np.array_equal(before, pool.identity):
             return
         self._identity = pool.identity.copy()
-        kept = np.flatnonzero(before == self._identity[: len(before)]).astype(np.int32)
-        votes = old.to_numpy().reshape(-1, VOXELS * VOTES)[kept]
-        self._votes = surface_votes.no_votes(pool.belief.shape[0])
-        surface_votes.set_votes(kept, votes.reshape(-1), self._votes)
+        gone = np.flatnonzero(before != self._identity[: len(before)]).astype(np.int32)
+        surface_votes.clear_votes(gone[gone < held], self._votes)

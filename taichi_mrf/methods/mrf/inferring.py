@@ -8,17 +8,16 @@ behind them. Between checkpoint and return no keyframe may be added, removed or 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferSteps, content_key, driven, sweep_steps
 from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.parts import MapParts
-from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.later import later
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import PoolSnapshot
@@ -29,14 +28,17 @@ else:
     (surfacing,) = later("taichi_mrf.methods.mrf", "surfacing")
 
 
+OF_MESSAGES = ("messages", "visible", "pending_visible", "change_count_at_last_sweep")
+"""Attributes of a keyframe that go with its messages."""
+
+
 @dataclass(frozen=True)
 class Checkpoint:
-    """A map's beliefs, and for each keyframe its visible bricks, its messages for them, and the bricks'
-    change counts at its last sweep. With the beliefs it keeps a state that was, whole: for queries to read
-    (:func:`showing`) and to go back to."""
+    """A map's beliefs, and for each keyframe what belongs to its messages (``OF_MESSAGES``). With the beliefs
+    it keeps a state that was, whole: for queries to read (:func:`showing`) and to go back to."""
 
     pool: PoolSnapshot
-    messages: dict[int, "tuple[VisibleBricks, ti.Ndarray | None, NDArray[np.int64] | None]"]
+    messages: dict[int, dict[str, Any]]
     messages_lost: bool
     settled: bool
 
@@ -130,7 +132,7 @@ def take_checkpoint(parts: MapParts) -> Checkpoint:
     """Copy the beliefs. The messages need no copy because full inference starts with new arrays."""
     return Checkpoint(
         parts.pool.snapshot(),
-        {k.id: (k.visible, k.messages, k.change_count_at_last_sweep) for k in parts.keyframes.values()},
+        {k.id: {name: getattr(k, name) for name in OF_MESSAGES} for k in parts.keyframes.values()},
         parts.messages_lost,
         parts.settled,
     )
@@ -139,7 +141,7 @@ def take_checkpoint(parts: MapParts) -> Checkpoint:
 @contextmanager
 def showing(parts: MapParts, checkpoint: Checkpoint) -> Iterator[None]:
     """MRFMap.showing: beliefs and messages are those of the checkpoint while the block runs."""
-    names = ("visible", "messages", "change_count_at_last_sweep", "pending_visible", "revision")
+    names = (*OF_MESSAGES, "revision")
     keyframes, settled = list(parts.keyframes.values()), parts.settled
     now = [{name: getattr(keyframe, name) for name in names} for keyframe in keyframes]
     try:
@@ -157,9 +159,8 @@ def showing(parts: MapParts, checkpoint: Checkpoint) -> Iterator[None]:
 
 def _give_back(keyframe: Keyframe, checkpoint: Checkpoint) -> None:
     """Give a keyframe its messages as of a checkpoint."""
-    then = checkpoint.messages[keyframe.id]
-    keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = then
-    keyframe.pending_visible = None
+    for name, value in checkpoint.messages[keyframe.id].items():
+        setattr(keyframe, name, value)
 
 
 def go_back(parts: MapParts, checkpoint: Checkpoint) -> None:

@@ -8,7 +8,7 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import leave
 from taichi_mrf.inference.footprint import find_footprint
-from taichi_mrf.inference.incremental import change_count_seen_by
+from taichi_mrf.inference.incremental import change_count_of
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, NoReturnRays, RayList
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
@@ -135,7 +135,11 @@ class KeyframeAllocator:
         """Update a keyframe's list of visible bricks and leave its messages as they are."""
         seen = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
         visible = self.registry.visible_again(keyframe.footprint, seen)
-        keyframe.pending_visible = None if visible is keyframe.visible else visible
+        counted = keyframe.change_count_at_last_sweep
+        if visible is not seen:
+            keyframe.pending_visible = visible
+            if counted is not None:
+                keyframe.change_count_at_last_sweep = change_count_of(visible, seen, counted)
 
     def refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
         """Bring a keyframe's visible bricks and messages up to date. Newly visible bricks start without a
@@ -143,7 +147,6 @@ class KeyframeAllocator:
         old, old_messages = keyframe.visible, keyframe.messages
         self.look_again(keyframe)
         if keyframe.pending_visible is not None:
-            keyframe.change_count_at_last_sweep = change_count_seen_by(keyframe, keyframe.pending_visible)
             keyframe.visible, keyframe.pending_visible = keyframe.pending_visible, None
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.precision)
