@@ -39,7 +39,7 @@ def test_the_figures_of_the_pages_are_those_of_the_result_files(repository: Path
     readme, *pages = [page.read_text(encoding="utf-8") for page in tables["PAGES"]]
     headers = re.findall(r"^(\|.*)\n\| ---", "\n".join(pages), re.MULTILINE)
     from_files = [row_of(columns) for columns, _ in files]
-    of_words = ["| question | answer | command |", "| topic | type | subscribers |"]
+    of_words = ["| topic | result | command |", "| topic | type | subscribers |"]
     assert sorted(headers) == sorted([*of_words, *from_files])
     assert any(header in readme for header in from_files)
     for text in (readme, *pages):
