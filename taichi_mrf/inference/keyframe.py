@@ -232,7 +232,8 @@ class Footprint:
     """Bricks that a depth image's rays cross, which depend on its pose and on nothing else in the map.
 
     ``crossed`` are the window's cells (bricks) that any ray crosses, ``surface`` those among them near a
-    measured surface, both ascending. ``longest`` bounds the voxels on any one ray.
+    measured surface, both ascending. ``longest`` bounds the voxels on any one ray,
+    with those on the shared path of its group.
     """
 
     window: Window
