@@ -151,7 +151,7 @@ def take_views(scene: Scene, sensor: Sensor, number: int, seed: int) -> list[Vie
 
 
 def _pose(scene: Scene, sensor: Sensor, share: float, index: int, draw: np.random.Generator) -> Array:
-    """T_world_camera of a view, ``share`` of the way along two rounds."""
+    """T_world_camera of a view, ``share`` of the path along two rounds."""
     turn, thin = _turn(), scene.thin
     while True:
         angle = 4 * math.pi * share + draw.normal(0, 0.3)

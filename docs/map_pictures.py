@@ -14,7 +14,7 @@ import yaml
 from PIL import Image
 
 import taichi_mrf
-from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
+from taichi_mrf.evaluation.pictures.figures import color_bar, draw_camera_path, new_figure
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction, upward_axis
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.export.formats import export_map
@@ -52,7 +52,7 @@ def level_map(run: Path) -> Image.Image:
     figure = new_figure(8.0, 6.2)
     axes = figure.add_subplot()
     axes.imshow(grey, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="nearest")
-    draw_way(axes, _way(m)[:, :2])
+    draw_camera_path(axes, _camera_path(m)[:, :2])
     axes.set(xlabel="x (m)", ylabel="y (m)")
     axes.set_title(f"z from {BAND_M[0]} to {BAND_M[1]} m: occupied (black), free (white), unknown (grey)")
     return _drawn(figure)
@@ -127,7 +127,7 @@ def mesh(run: Path) -> Image.Image:
     return _drawn(figure)
 
 
-def _way(m: taichi_mrf.MRFMap) -> np.ndarray:
+def _camera_path(m: taichi_mrf.MRFMap) -> np.ndarray:
     """The positions of the keyframes' cameras, (K, 3) metres."""
     return np.array([each.T_world_camera[:3, 3] for each in m.keyframes.values()])
 

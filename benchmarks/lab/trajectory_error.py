@@ -2,8 +2,8 @@
 
 J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems" (IROS 2012): the absolute error is
 what is left when one trajectory is laid on the other by the best rigid motion. Anchored, the two agree at
-the first frame, so that the error of the last one is the drift of the whole way. The error of a step compares
-motions from frame to frame, which shows where drift arises.
+the first frame, so that the error of the last one is the drift of the whole path. The error of a step
+compares motions from frame to frame, which shows where drift arises.
 """
 
 from collections.abc import Mapping

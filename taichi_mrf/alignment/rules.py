@@ -296,7 +296,7 @@ class Rules:
     """Metres by which a tracked camera may be off wherever it goes."""
 
     drift: float = 0.03
-    """Share of its way since then by which it may be off as well."""
+    """Share of its path since then by which it may be off as well."""
 
     view_m: float = 1.0
     """Metres that two cameras that see the same may stand apart."""

@@ -24,7 +24,6 @@ from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, checked, explained_frame, pooled
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.sensor.noise import NoiseTable
 
 FRAMES, RUNS, LONGEST_STRIDE = 60, 3, 10
 """Of a long recording so many frames are used, in so many runs; of one run so many frames apart at most,
@@ -117,8 +116,6 @@ def learn_sigma(
         result = map_sequence(frames, changed, skip_bad_frames=True, should_stop=should_stop)
         parts = _held_out(result, frames)
         measured = pooled(parts)
-        if measured is None and result.held_out:
-            _check_polynomials(result, frames)
         if measured is None:
             raise DatasetError(
                 f"{dataset.name}: --noise auto cannot learn: {len(result.held_out)} held-out frames hold too "
@@ -240,22 +237,6 @@ def _with(config: Config, law: SigmaLaw, prior: dict[str, Any]) -> Config:
 def _rounded(value: float) -> float:
     """Rounded to four significant digits, which is all that counts."""
     return float(f"{value:.4g}")
-
-
-def _check_polynomials(result: MappingResult, frames: Dataset) -> None:
-    """Raise DatasetError if held-out frames have a noise that no factor on sigma changes."""
-    for index in result.held_out:
-        try:
-            frame = frames.read(index)
-        except FrameError:
-            continue
-        noise = frame.own_for(result.map.sensor).noise_model(result.map.noise, frame.depth_m)
-        if not isinstance(noise.table(frame.camera), NoiseTable):
-            raise DatasetError(
-                f"{frames.name}: --noise auto cannot learn: the noise {type(noise).__name__} of frame "
-                f"{frame.name} is not made of polynomials in depth, so there is no sigma to multiply; "
-                "--noise given takes it as it is, or name another with --sensor.sigma"
-            )
 
 
 def _held_out(result: MappingResult, frames: Dataset) -> list[Explained]:

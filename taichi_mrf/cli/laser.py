@@ -65,7 +65,7 @@ class MethodResult:
 
 
 def write_result(
-    folder: Path, name: str, method: str, outcome: MethodResult, way_x_y: NDArray[np.float64]
+    folder: Path, name: str, method: str, outcome: MethodResult, path_x_y: NDArray[np.float64]
 ) -> list[Path]:
     """Write the map and the energies of one method into a folder; returns the paths. Raises MapFileError."""
     laser_map = outcome.map
@@ -73,7 +73,7 @@ def write_result(
     paths = write_map_server(folder, image, laser_map.cell_size, laser_map.lower_x_y)
     paths.append(_write_marginals(folder / "marginals.npz", laser_map))
     title = f"{name}: {method_name(method)}"
-    paths.append(_write_figure(folder / "map.png", map_figure(laser_map, way_x_y, title)))
+    paths.append(_write_figure(folder / "map.png", map_figure(laser_map, path_x_y, title)))
     return paths + write_energies(folder, name, {method: outcome})
 
 
@@ -92,10 +92,10 @@ def write_energies(folder: Path, name: str, outcomes: Mapping[str, MethodResult]
 
 
 def write_comparison(
-    folder: Path, maps: Mapping[str, LaserMap], way_x_y: NDArray[np.float64], plan: FloorPlan | None
+    folder: Path, maps: Mapping[str, LaserMap], path_x_y: NDArray[np.float64], plan: FloorPlan | None
 ) -> list[Path]:
     """Write ``maps.png``, in which the floor plan and all maps stand side by side."""
-    return [_write_figure(folder / "maps.png", comparison_figure(maps, way_x_y, plan))]
+    return [_write_figure(folder / "maps.png", comparison_figure(maps, path_x_y, plan))]
 
 
 def energy_csv(outcomes: Mapping[str, MethodResult]) -> str:
@@ -259,18 +259,18 @@ def _write(
     options: Laser, scans: LaserScans, outcomes: dict[str, MethodResult], registration: Registration | None
 ) -> list[Path]:
     """The maps first: they are what the time went into."""
-    way = scans.pose_x_y_theta[:, :2]
+    path_x_y = scans.pose_x_y_theta[:, :2]
     written = []
     several = len(options.runs()) > 1
     for name, outcome in outcomes.items():
         folder = options.out / name if several else options.out
         folder.mkdir(exist_ok=True)
-        written += write_result(folder, scans.name, name, outcome, way)
+        written += write_result(folder, scans.name, name, outcome, path_x_y)
     if several:
         written += write_energies(options.out, scans.name, outcomes)
         maps = {name: outcome.map for name, outcome in outcomes.items()}
         plan = None if registration is None else registration.plan
-        written += write_comparison(options.out, maps, way, plan)
+        written += write_comparison(options.out, maps, path_x_y, plan)
         written += write_table(options.out, comparison_table(scans.name, outcomes))
     write_text(options.out / CONFIG_FILE, commented_yaml(options.settings))
     return [*written, options.out / CONFIG_FILE]

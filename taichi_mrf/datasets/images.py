@@ -236,6 +236,23 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     return _decode(_image_file(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
+def read_levels(path: Path, channels: int, camera: PinholeCamera) -> NDArray[np.uint8]:
+    """The numbers of an image's pixels, (H, W) uint8, of several channels (H, W, channels) with red first.
+    Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
+    of another size than the camera's."""
+    image = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
+    if image.dtype != np.uint8 or image.size != channels * image.shape[0] * image.shape[1]:
+        wanted = _kind(np.empty((1, 1, channels), np.uint8))
+        raise DatasetError(f"{path}: expected {wanted}, numbers and no palette; found {_kind(image)}")
+    return image if channels == 1 else image[..., [2, 1, 0, 3][:channels]]
+
+
+def _kind(image: NDArray) -> str:
+    """An image's bits and channels in words."""
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    return f"{8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
+
+
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read; a broken one is reported with its frame."""
     for path in paths:
@@ -256,15 +273,13 @@ def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) 
 
 def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
     if image.ndim != 2 or image.dtype != np.uint16:
-        channels = 1 if image.ndim == 2 else image.shape[2]
         raise DatasetError(
-            f"{where}: not a depth image: expected 16-bit grey, "
-            f"found {8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
+            f"{where}: not a depth image: expected 16-bit grey, found {_kind(image)}"
             + (
                 "; a picture of depth in colours or 8 bits has lost the measurements, but for a simulator's, "
                 "whose colours are bytes of one number (CARLA: 1000 m * (R + 256 G + 65536 B) / (2^24 - 1)): "
                 "compute depth, and write it as 16-bit millimetres"
-                if image.itemsize == 1 and channels > 2
+                if image.itemsize == 1 and image.ndim == 3
                 else "; a picture of depth in 8 bits has lost the measurements"
                 if image.itemsize == 1
                 else ""

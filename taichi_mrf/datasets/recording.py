@@ -3,7 +3,7 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -23,6 +23,7 @@ from taichi_mrf.datasets.images import (
     read_color,
     read_depth,
     read_grey,
+    read_levels,
     stated_size,
 )
 from taichi_mrf.datasets.options import ReadOptions
@@ -31,7 +32,8 @@ from taichi_mrf.errors import DatasetError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import is_file
+from taichi_mrf.system.files import is_file, is_folder
+from taichi_mrf.voxels.layers import FromPixels, pixel_layers
 
 ASKED = "--depth-scale"
 """Origin of a scale that the caller gives."""
@@ -60,7 +62,8 @@ class Recording(Table[RecordedFrame]):
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from. Unless it
     is the caller's or ``scale_stated`` by a file, :meth:`check_scale` may find another. If it is
     ``scale_assumed``, not even the format says so. ``color_camera`` took the colour images, unless they are
-    registered to depth.
+    registered to depth. ``layer_images`` are the folders of images beside depth that layers of voxels follow
+    from, each with an image NAME.png for the frame NAME.
     """
 
     camera: PinholeCamera
@@ -70,6 +73,7 @@ class Recording(Table[RecordedFrame]):
     scale_stated: bool = False
     color: bool = True
     color_camera: ColorCamera | None = None
+    layer_images: Mapping[Path, FromPixels] = field(default_factory=dict)
     scale_notes: list[str] = field(default_factory=list)
     """Notes of the last check of the scale."""
 
@@ -98,7 +102,11 @@ class Recording(Table[RecordedFrame]):
             color = self._read_color(row.color_file, depth_m, camera)
         if self.confidence is not None and row.confidence_file is not None:
             sigma_m = self._read_sigma(row.confidence_file, depth_m, self.confidence, camera)
-        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, color, sigma_m)
+        images = {
+            made.image: read_levels(folder / f"{row.name}.png", made.channels, camera)
+            for folder, made in self.layer_images.items()
+        }
+        return Frame(depth_m, T_world_camera, camera, row.stamp, row.name, color, sigma_m, images=images)
 
     def _read_sigma(
         self, path: Path, depth_m: NDArray[np.float32], confidence: Confidence, camera: PinholeCamera
@@ -189,6 +197,9 @@ def recording(
         size = first_size(row.depth_file for row in rows)
         camera = of_image_size(camera, size, turned)
         rows = [replace(row, camera=row.camera and of_image_size(row.camera, size, turned)) for row in rows]
+    beside = {folder / made.image: made for made in pixel_layers().values() if made.image != "color"}
+    beside = {place: made for place, made in beside.items() if is_folder(place)}
+    said += [f"{made.image}: from the images in {place.name}/" for place, made in beside.items()]
     return Recording(
         folder.name,
         camera,
@@ -198,6 +209,7 @@ def recording(
         steps_per_metre=options.depth_scale or steps_per_metre,
         scale_source=ASKED if options.depth_scale else scale_source,
         color=options.color,
+        layer_images=beside,
         **more,
     )
 

@@ -22,7 +22,7 @@ from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import Answer, View
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.sensor.camera import Camera, check_camera
-from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
+from taichi_mrf.sensor.noise import CameraNoise, NoiseModel, PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK
 
 Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]
@@ -74,7 +74,7 @@ class JudgedView:
     survey: SurfaceSurvey
     voxel_size: float
     max_depth: float
-    noise: NoiseTable
+    noise: CameraNoise
 
     @property
     def judged(self) -> NDArray[np.bool_]:

@@ -24,7 +24,7 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.noise import CameraNoise
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
@@ -53,7 +53,7 @@ def probability_below(
     measured_m: NDArray[np.float32],
     T_world_camera: Pose,
     camera: Camera,
-    noise: NoiseTable,
+    noise: CameraNoise,
     max_depth: float,
 ) -> NDArray[np.float32]:
     """For each measurement of (H, W) ``measured_m`` that is not 0, row by row, the probability that the map

@@ -178,10 +178,10 @@ class FloorPlanScores:
     """How many cells were judged: those that beams touch."""
 
 
-def true_cells(plan: FloorPlan, laser_map: LaserMap, way_x_y: NDArray[np.float64]) -> NDArray[np.int8]:
+def true_cells(plan: FloorPlan, laser_map: LaserMap, path_x_y: NDArray[np.float64]) -> NDArray[np.int8]:
     """State of each of the map's cells by the plan, (rows, columns): OCCUPIED if a pixel of wall lies in it,
-    FREE if it is open and can be reached from the robot's way (P, 2), HIDDEN otherwise."""
-    reached = _reachable(plan, way_x_y)
+    FREE if it is open and can be reached from the robot's path (P, 2), HIDDEN otherwise."""
+    reached = _reachable(plan, path_x_y)
     rows, columns = laser_map.occupied.shape
     size = laser_map.cell_size
     # So many samples along a side that none of the pixels that lie wholly in a cell is missed.
@@ -242,11 +242,11 @@ def _grown(cells: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
 
 
-def _reachable(plan: FloorPlan, way_x_y: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Pixels without wall that hang together with one on the robot's way."""
+def _reachable(plan: FloorPlan, path_x_y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels without wall that hang together with one on the robot's path."""
     # Neighbours along the axes only: space does not leak through a wall's diagonal.
     _, region = cv2.connectedComponents((~plan.wall).astype(np.uint8), connectivity=4)
-    row, column = plan.pixels(way_x_y)
+    row, column = plan.pixels(path_x_y)
     inside = plan.holds(row, column)
     visited = np.unique(region[row[inside], column[inside]])
     return np.asarray(np.isin(region, visited[visited > 0]))

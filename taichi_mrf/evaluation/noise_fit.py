@@ -32,7 +32,7 @@ from taichi_mrf.sensor.forward import SEGMENT
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, unwidened_noise
+from taichi_mrf.sensor.noise import CameraNoise, NoiseModel, unwidened_noise
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
@@ -102,10 +102,10 @@ def explained(
 ) -> Explained | None:
     """How well a map explains the measurements of a depth image (H, W) that it has not seen, of which
     ``noise`` is assumed; ``stated`` is the noise without what was learnt, if that differs. None if there are
-    none to judge, or noise is not made of polynomials."""
+    none to judge."""
     table = noise.table(camera)
     pixels = np.flatnonzero((depth_m > 0) & (depth_m <= m.sensor.max_depth))
-    if not len(pixels) or not isinstance(table, NoiseTable):
+    if not len(pixels):
         return None
     # Evenly over the image, but not in columns: a stride that divides the width would make some.
     kept = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), PIXELS)).astype(np.int64)].astype(np.int32)
@@ -124,7 +124,7 @@ def _log_densities(
     depth_m: NDArray[np.float32],
     T_world_camera: Pose,
     camera: Camera,
-    noise: NoiseTable,
+    noise: CameraNoise,
 ) -> NDArray[np.float64]:
     """The log density of the measurements of some pixels (n,) under each multiple of sigma, (n, OCTAVES)."""
     view, reach_m = m.view, m.sensor.max_depth
@@ -179,9 +179,8 @@ class _Seen(Struct):
 def _explain_voxel(ray: Template, given: Template, voxel: I32, near: F32, far: F32) -> I32:
     """One voxel of a ray."""
     here = dim(ray, occlusion(given.belief[voxel], given.medium.occlusion), near, far)
-    noise = given.noise
     for k in range(given.factors.shape[0]):
-        noise.sigma_terms = given.factors[k] * given.noise.sigma_terms
+        noise = given.sensor.noise.times(given.noise, given.factors[k])
         given.out.density[given.i, k] += here * given.sensor.likelihood(
             given.measured, near, far, noise, given.medium.voxel_size, SEGMENT
         )

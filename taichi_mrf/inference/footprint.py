@@ -17,7 +17,7 @@ from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnR
 from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system.compiler import ti
@@ -177,6 +177,15 @@ def _mark_brick(mark: Template, marks: Template, ray: Template, brick: IVec3, t:
     return 1
 
 
+@ti.func
+def _most_voxels(ray: Template, begin: F32, end: F32) -> I32:
+    """A bound on the voxels of a ray between two depths, and on its steps: each leaves a voxel through a
+    face, or enters a brick anew."""
+    along = ti.abs(ray.direction[0]) + ti.abs(ray.direction[1]) + ti.abs(ray.direction[2])
+    faces = ti.max(end - begin, 0.0) * along
+    return ti.cast(faces, ti.i32) + 4 + 2 * (ti.cast(faces / BRICK, ti.i32) + 4)
+
+
 @kernel
 def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: _Marks) -> None:
     """Mark the bricks that each ray crosses."""
@@ -185,6 +194,7 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
         apart = end_of_shared_path(rays, group, middle, reach.min_depth, reach.max_depth)
         begin, end = reach.min_depth, apart
         clip(middle, begin, end, marks.lower, marks.upper)
+        shared = _most_voxels(middle, begin, end)
         walk_bricks(middle, begin, end, marks.shape, marks.kinds, False, _mark_brick, free, marks)
         for i in range(rays.first[group], rays.first[group + 1]):
             measured = rays.depth[i]
@@ -192,13 +202,8 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
             last = sensor.until(measured, rays.last[i] + reach.beyond_m)
             begin, end = apart, ti.min(last, reach.max_depth)
             clip(ray, begin, end, marks.lower, marks.upper)
-            if end > reach.min_depth:
-                # A step along the ray leaves a voxel through a face, or enters a brick anew.
-                along = ti.abs(ray.direction[0]) + ti.abs(ray.direction[1]) + ti.abs(ray.direction[2])
-                faces = (end - reach.min_depth) * along
-                bricks = ti.cast(faces / BRICK, ti.i32) + 4
-                steps = ti.cast(faces, ti.i32) + 4 + 2 * bricks
-                if steps > marks.longest[0]:
-                    ti.atomic_max(marks.longest[0], steps)
+            steps = ti.max(shared + _most_voxels(ray, begin, end), _most_voxels(ray, 0.0, end))
+            if steps > marks.longest[0]:
+                ti.atomic_max(marks.longest[0], steps)
             mark = _Mark(sensor.nearest_depth(measured, noise, reach.end_sigmas))
             walk_bricks(ray, begin, end, marks.shape, marks.kinds, False, _mark_brick, mark, marks)

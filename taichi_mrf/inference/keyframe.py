@@ -13,7 +13,7 @@ from taichi_mrf.kernels.resident import Resident, on_host, resident, zeros
 from taichi_mrf.kernels.types import I32, F32Array, I32Array
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+from taichi_mrf.sensor.noise import CameraNoise, NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
 from taichi_mrf.system.compiler import ti
@@ -87,7 +87,7 @@ class DepthImage:
     depth: Resident
     camera: Camera
     sensor: Sensor
-    noise_table: NoiseTable
+    noise_table: CameraNoise
     rays: int
     farthest: NDArray[np.float32]
     color: NDArray[np.uint8] | None = None
@@ -115,7 +115,7 @@ class DepthImage:
     def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
         """Copy of the image from a pose of another covariance (6, 6), None for an exact one: with the noise
         of sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
-        ConfigError if the noise is not made of polynomials."""
+        ConfigError if the noise's sigma cannot be scaled."""
         image = self.at_certain_pose
         if pose_covariance is None:
             return image
@@ -232,7 +232,8 @@ class Footprint:
     """Bricks that a depth image's rays cross, which depend on its pose and on nothing else in the map.
 
     ``crossed`` are the window's cells (bricks) that any ray crosses, ``surface`` those among them near a
-    measured surface, both ascending. ``longest`` bounds the voxels on any one ray.
+    measured surface, both ascending. ``longest`` bounds the voxels on any one ray,
+    with those on the shared path of its group.
     """
 
     window: Window

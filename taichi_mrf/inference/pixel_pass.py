@@ -124,7 +124,7 @@ class PixelVisitor(RayVisitor, ABC):
     @ti.func
     def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
         if here > 0.0:
-            j = sight.worker * self.trace.longest + ahead.voxels
+            j = self.trace.place(sight.worker, ahead.voxels)
             self.trace.voxel[j] = voxel
             self.trace.step[j] = Vec4(here, 0.0, 0.0, 0.0)
             ahead.voxels += 1
@@ -137,7 +137,7 @@ class PixelVisitor(RayVisitor, ABC):
             stride = self.stride(sight.measured, sight.pixels)
             said = self.read(sight.block)
             for step in range(ahead.voxels):
-                j = sight.worker * self.trace.longest + step
+                j = self.trace.place(sight.worker, step)
                 self.give(self.trace.voxel[j], self.trace.step[j][0] / total * self.scale * stride, said)
 
 

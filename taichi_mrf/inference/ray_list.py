@@ -23,6 +23,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR, pixel_ray
 
@@ -129,7 +130,8 @@ class RayBundler:
         )
         counts, groups, widest = (np.zeros(tiles, np.int32) for _ in range(3))
         pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level, self._group)
-        _choose(image.depth, image.sensor, rule, pixels, counts, groups)
+        choose = _choose_by_level if runtime.on_gpu() else _choose
+        choose(image.depth, image.sensor, rule, pixels, counts, groups)
         rays = RayList.empty(int(counts.sum()), int(groups.sum()))
         first, first_group = (np.cumsum(each, dtype=np.int32) - each for each in (counts, groups))
         _write_down(camera.width, camera.height, pixels, first, first_group, rays, widest)
@@ -237,13 +239,7 @@ def _choose(
             right, bottom = ti.min(left + TILE, width), ti.min(top + TILE, height)
             for v in range(top, bottom):
                 for u in range(left, right):
-                    i = v * width + u
-                    measured = depth[i]
-                    blocks.nearest[i] = measured if measured > 0.0 else FAR
-                    blocks.farthest[i] = measured
-                    blocks.mean[i] = measured
-                    blocks.level[i] = 0 if measured > 0.0 else -1
-                    blocks.group[i] = 0
+                    _begin(blocks, depth, v * width + u)
             for n in range(1, LEVELS + 1):
                 wide, high = 1 << (n + 1) // 2, 1 << n // 2
                 in_a_row = TILE_BITS - (n + 1) // 2  # their number's logarithm: no divisions
@@ -260,6 +256,48 @@ def _choose(
                     grouped += ti.cast(_has_rays(blocks, i), ti.i32)
             counts[tile] = rays
             groups[tile] = grouped
+
+
+@kernel
+def _choose_by_level(
+    depth: F32Array,
+    sensor: Sensor,
+    rule: _MergeRule,
+    blocks: _PixelBlocks,
+    counts: I32Array,
+    groups: I32Array,
+) -> None:
+    """As :func:`_choose` for a GPU, which makes all blocks of a level side by side. On a CPU a tile, which
+    stays in the cache, is made level by level in a sixth less time."""
+    for i in range(depth.shape[0]):
+        _begin(blocks, depth, i)
+    for n in ti.static(range(1, LEVELS + 1)):
+        for block in range(counts.shape[0] * (TILE * TILE >> n)):
+            tile, inner = block // (TILE * TILE >> n), block % (TILE * TILE >> n)
+            wide, high, width = 1 << (n + 1) // 2, 1 << n // 2, sensor.camera.width
+            across = (width + TILE - 1) // TILE
+            u = tile % across * TILE + inner % (TILE // wide) * wide
+            v = tile // across * TILE + inner // (TILE // wide) * high
+            if u + wide <= width and v + high <= depth.shape[0] // width:
+                _merge(rule, blocks, sensor, u, v, n)
+    for i in range(depth.shape[0]):
+        width = sensor.camera.width
+        tile = i // width // TILE * ((width + TILE - 1) // TILE) + i % width // TILE
+        if blocks.level[i] >= 0:
+            counts[tile] += 1
+        if _has_rays(blocks, i):
+            groups[tile] += 1
+
+
+@ti.func
+def _begin(blocks: Template, depth: Template, i: I32):
+    """Make a block and a group of one pixel."""
+    measured = depth[i]
+    blocks.nearest[i] = measured if measured > 0.0 else FAR
+    blocks.farthest[i] = measured
+    blocks.mean[i] = measured
+    blocks.level[i] = 0 if measured > 0.0 else -1
+    blocks.group[i] = 0
 
 
 @ti.func

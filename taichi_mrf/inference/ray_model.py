@@ -6,6 +6,7 @@ from typing import Literal
 
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Template, Vec4Array
+from taichi_mrf.system.compiler import ti
 
 END_SIGMAS = 3.0
 """A ray ends this many sigma behind its measurement, and bricks are allocated this many sigma around it."""
@@ -83,19 +84,25 @@ class SweptVoxels(Bundle):
 
 @dataclass(frozen=True)
 class Trace(Bundle):
-    """Record of rays on the way out, for the way back: a part of ``longest`` steps for each worker."""
+    """Record of rays on the way out, for the way back: steps of the longest ray for each worker."""
 
     voxel: I32Array
-    """(workers * longest): the voxel of each step."""
+    """(workers * steps): the voxel of each step."""
 
     step: Vec4Array
-    """(workers * longest): length, 1 - m to its power, nu * vis, before."""
+    """(workers * steps): length, 1 - m to its power, nu * vis, before."""
 
-    longest: I32
-    """No ray crosses more voxels than this."""
+    worker_stride: I32
+    step_stride: I32
+    """From a worker's step to the next worker's, and to its own next one."""
 
     steps: I32Array
     """(workers): receives the number of voxels that each worker's rays have crossed."""
+
+    @ti.func
+    def place(self, worker: I32, step: I32):
+        """Place of a worker's step."""
+        return worker * self.worker_stride + step * self.step_stride
 
 
 def log_pass(pass_through: float) -> float:

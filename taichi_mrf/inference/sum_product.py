@@ -132,13 +132,13 @@ def send_messages(
             group = workers.ray(worker, turn)
             if group < rays.group_number:
                 # In front of all surfaces of the group, forward: nu_j is 0, so only vis_i changes.
-                support, first_step = rays.support[group], worker * trace.longest
+                support = rays.support[group]
                 middle = block_ray(rays.groups[group], sensor, view)
                 apart = end_of_shared_path(rays, group, middle, begin_depth, model.max_depth)
                 begin, end = begin_depth, apart
                 clip(middle, begin, end, space.lower, space.upper)
                 common, behind_all, pixels_all = ForwardPass(1.0, 0.0, 0), 0.0, 0.0
-                shared = _SharedPath(model, swept, trace, first_step, middle.direction.norm())
+                shared = _SharedPath(model, swept, trace, worker, middle.direction.norm())
                 walk_voxels(middle, begin, end, space, _trace_free, common, shared)
 
                 for i in range(rays.first[group], rays.first[group + 1]):
@@ -157,8 +157,8 @@ def send_messages(
                     # Step 4, forward, eqs. 4 and 11, from the camera outwards:
                     # before_i = sum_{j<i} nu_j m_j vis_j, vis_i = prod_{k<i} (1 - m_k)^l_k.
                     ahead = ForwardPass(common.visibility, 0.0, 0)
-                    own_step = first_step + common.voxels
-                    walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, own_step))
+                    traced = _Traced(cast, trace, worker, common.voxels)
+                    walk_voxels(ray, begin, end, space, _trace_voxel, ahead, traced)
                     trace.steps[worker] += ahead.voxels
 
                     # A ray that gets through to the end of the map may have met its surface there.
@@ -169,7 +169,7 @@ def send_messages(
                     # Step 5, backward, eqs. 13 and 14, from the far end: occupied = before_i + nu_i vis_i,
                     # empty = before_i + behind_i / (1 - m_i)^l_i, and log(occupied / empty) is sent.
                     for step in range(ahead.voxels):
-                        j = own_step + ahead.voxels - 1 - step
+                        j = trace.place(worker, common.voxels + ahead.voxels - 1 - step)
                         weight, free = trace.step[j][0], trace.step[j][1]
                         density, before = trace.step[j][2], trace.step[j][3]
                         message = _message(model, before, density, behind, free, largest)
@@ -182,7 +182,7 @@ def send_messages(
                 trace.steps[worker] += common.voxels
                 behind = behind_all / pixels_all
                 for step in range(common.voxels):
-                    j = first_step + step
+                    j = trace.place(worker, step)
                     weight, free = trace.step[j][0], trace.step[j][1]
                     message = _message(model, 0.0, 0.0, behind, free, largest)
                     add_message(swept.sums, trace.voxel[j], pixels_all * weight, message, swept.scale)
@@ -190,12 +190,12 @@ def send_messages(
 
 @dataclass(frozen=True)
 class _SharedPath(Bundle):
-    """The shared path of a group, which writes down its steps from ``first_step`` of the trace on."""
+    """The shared path of a group, which a worker writes down in its trace."""
 
     model: RayModel
     swept: SweptVoxels
     trace: Trace
-    first_step: I32
+    worker: I32
     voxels_per_depth: F32
 
 
@@ -206,7 +206,7 @@ def _trace_free(ahead: Template, way: Template, voxel: I32, near: F32, far: F32)
     if ti.static(not way.model.segment_lengths):
         length = 1.0
     free = exp_of_negative(log_free)
-    j = way.first_step + ahead.voxels
+    j = way.trace.place(way.worker, ahead.voxels)
     way.trace.voxel[j] = voxel
     way.trace.step[j][0] = length
     way.trace.step[j][1] = free
@@ -217,11 +217,12 @@ def _trace_free(ahead: Template, way: Template, voxel: I32, near: F32, far: F32)
 
 @dataclass(frozen=True)
 class _Traced(Bundle):
-    """A ray that writes down its steps, from ``first_step`` of the trace on."""
+    """A ray that a worker writes down in its trace, after the ``shared`` steps of its group."""
 
     cast: Cast
     trace: Trace
-    first_step: I32
+    worker: I32
+    shared: I32
 
 
 @ti.func
@@ -263,7 +264,7 @@ def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: 
     """One voxel of the forward pass, written down in the trace."""
     met = crossing(traced.cast, voxel, near, far)
     met[0] = _weight(traced.cast, met[0])
-    j = traced.first_step + ahead.voxels
+    j = traced.trace.place(traced.worker, traced.shared + ahead.voxels)
     traced.trace.voxel[j] = voxel
     traced.trace.step[j] = _explain(ahead, met)
     ahead.voxels += 1

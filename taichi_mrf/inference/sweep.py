@@ -149,7 +149,7 @@ class Sweeper:
         """The scratch made ready for a keyframe's rays; it must see a brick. It holds the cavity of
         ``belief`` (pool * 512) without ``messages`` (eq. 6), and sums of zero, to which rays add."""
         visible, footprint, n = keyframe.visible, keyframe.footprint, len(keyframe.visible.slots)
-        longest = 2 * footprint.longest  # a group's shared path, and that of one of its rays
+        longest = footprint.longest
         workers = workers_for(runtime.active() or "cpu", runtime.is_software(), longest, TRACE_BYTES)
         self._reserve(n, workers.number * longest, workers.number)
         window, bricks = footprint.window, visible.on_device()
@@ -165,7 +165,7 @@ class Sweeper:
             window.viewpoint(keyframe.T_world_camera),
             self.index.space(window, self.volume.lower, self.volume.upper),
             swept,
-            Trace(self.trace_voxel, self.trace, longest, self.steps),
+            Trace(self.trace_voxel, self.trace, *workers.strides(longest), self.steps),
             workers,
             lambda: self.index.clear(window, bricks.cells),
         )

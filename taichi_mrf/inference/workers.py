@@ -25,6 +25,11 @@ class Workers(Bundle):
     block: Template
     """Threads in a block on a GPU; 0 leaves it to Taichi."""
 
+    def strides(self, longest: int) -> tuple[int, int]:
+        """Strides of a trace with ``longest`` steps for each worker (ray_model.Trace). On a processor a
+        worker's steps are side by side; on a GPU those of all workers, which write at the same time."""
+        return (1, self.number) if runtime.on_gpu() else (longest, 1)
+
     @ti.func
     def turns(self, rays: I32):
         """Number of rays that each worker is dealt, those beyond the last included."""
@@ -41,14 +46,14 @@ def workers_for(arch: str, software: bool, longest: int, trace_bytes: int) -> Wo
     """Workers for a backend, whose traces hold ``longest`` voxels of ``trace_bytes`` each.
 
     On a CPU a worker takes runs of rays, and its trace stays in the cache; on a GPU it is a thread,
-    neighbours take neighbouring rays, and the trace is bounded to half a GB.
+    neighbours take neighbouring rays, and the trace is bounded to a GB.
     """
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
         return Workers(64, 16, 512, 0)
     if software:
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
-    most = (512 << 20) // (trace_bytes * longest)
+    most = (1 << 30) // (trace_bytes * longest)
     return Workers(max(256, min(65536, most)), 1, 1, 128)
 
 

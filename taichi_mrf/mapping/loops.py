@@ -55,7 +55,7 @@ class LoopCloser:
         self._map, self._appearances, self._fixed = tracker.map, tracker.appearances, fixed
         self._step_config = replace(config, translation_sigma=RULES.step_m, rotation_sigma=RULES.step_rad)
         self._order: list[int] = []
-        self._way_m: dict[int, float] = {}
+        self._path_m: dict[int, float] = {}
         self._edges: list[PoseEdge] = []
         self._waiting: list[PoseEdge] = []
         self._anchored: set[int] = set()
@@ -83,12 +83,12 @@ class LoopCloser:
         self._waiting = [e for e in self._waiting if e.first in keyframes and e.second in keyframes]
 
     def _enter(self, id: int) -> None:
-        way_m = 0.0
+        path_m = 0.0
         if self._order:
             last = self._order[-1]
-            way_m = self._way_m[last] + tangent_norms(self._pose(last), self._pose(id))[1]
+            path_m = self._path_m[last] + tangent_norms(self._pose(last), self._pose(id))[1]
         self._order.append(id)
-        self._way_m[id] = way_m
+        self._path_m[id] = path_m
 
     def _pose(self, id: int) -> Pose:
         return self._map.keyframes[id].T_world_camera
@@ -142,7 +142,7 @@ class LoopCloser:
         return apart_m < RULES.view_m + self._drift_m(id, older) and turned < RULES.view_rad
 
     def _drift_m(self, id: int, older: int) -> float:
-        return RULES.drift_m + RULES.drift * (self._way_m[id] - self._way_m[older])
+        return RULES.drift_m + RULES.drift * (self._path_m[id] - self._path_m[older])
 
     def _loop(self, id: int, older: int, points: OrientedPoints) -> PoseEdge | None:
         """The step from an older keyframe to a new one, if the new one's image fits there."""

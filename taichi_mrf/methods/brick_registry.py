@@ -36,8 +36,9 @@ class BrickRegistry:
         self.before_claim: Callable[[Bricks], None] | None = None  # with the bricks (n, 3) to be crossed
         self.on_release: list[Callable[[Bricks], None]] = []  # with the bricks (n, 3) that are gone
 
-    def claim(self, footprint: Footprint) -> None:
-        """Allocate a keyframe's surface bricks and count its ownership and its crossings.
+    def claim(self, footprint: Footprint) -> VisibleBricks:
+        """Allocate a keyframe's surface bricks and count its ownership and its crossings; returns what it
+        sees then.
 
         Raises CapacityError if there is not enough memory; nothing has changed then.
         """
@@ -45,13 +46,14 @@ class BrickRegistry:
         self.topology.check(crossed, self.voxel_size)
         if self.before_claim is not None:
             self.before_claim(crossed)
-        surface = footprint.window.bricks_of(footprint.surface)
-        slots = self.topology.slots(surface)
-        missing = slots < 0
-        if missing.any():
-            slots[missing] = self.create(surface[missing])
-        self.pool.owners[slots] += 1
+        slots = self.topology.slots(crossed)
+        surface = np.searchsorted(footprint.crossed, footprint.surface)
+        missing = surface[slots[surface] < 0]
+        if len(missing):
+            slots[missing] = self.create(crossed[missing])
+        self.pool.owners[slots[surface]] += 1
         self.topology.add_crossings(crossed, 1)
+        return self._list(footprint.crossed, slots)
 
     def anchor_at(self, position_m: NDArray[np.float64]) -> None:
         """Centre the volume on a position (3,) in the world, if its place is not fixed yet."""
@@ -169,21 +171,22 @@ class BrickRegistry:
     def visible(self, footprint: Footprint) -> VisibleBricks:
         """The allocated bricks among those that a keyframe's rays cross."""
         slots = self.topology.slots(footprint.window.bricks_of(footprint.crossed))
-        exist = slots >= 0
-        return self._list(footprint.crossed[exist], slots[exist])
+        return self._list(footprint.crossed, slots)
 
     def _list(self, cells: Cells, slots: NDArray[np.int32]) -> VisibleBricks:
+        """Those of some bricks, cells with their slots, that exist."""
+        exist = slots >= 0
+        cells, slots = cells[exist], slots[exist]
         return VisibleBricks(cells, slots, self.pool.identity[slots], self.version)
 
 
 def _merged(
     cells: Cells, slots: NDArray[np.int32], other_cells: Cells, other_slots: NDArray[np.int32]
 ) -> tuple[Cells, NDArray[np.int32]]:
-    """A list of bricks, ascending cells with their slots, in which other ones have the slots that are given:
-    -1 for a brick that is gone."""
+    """A list of bricks, ascending cells with their slots, in which some have other slots, -1 for none."""
     place = np.searchsorted(cells, other_cells)
     listed = np.append(cells, -1)[place] == other_cells
-    cells, slots = np.delete(cells, place[listed]), np.delete(slots, place[listed])
-    exist = other_slots >= 0
-    place = np.searchsorted(cells, other_cells[exist])
-    return np.insert(cells, place, other_cells[exist]), np.insert(slots, place, other_slots[exist])
+    slots = slots.copy()
+    slots[place[listed]] = other_slots[listed]
+    place, other_cells, other_slots = place[~listed], other_cells[~listed], other_slots[~listed]
+    return np.insert(cells, place, other_cells), np.insert(slots, place, other_slots)

@@ -326,9 +326,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         image = DepthImage.upload(record.depth_m, record.camera, self.noise, own=record.own)
         footprint = self._reach(image, record.T_world_camera)
         self._registry.anchor_at(record.T_world_camera[:3, 3])
-        self._registry.claim(footprint)
+        slots = self._registry.claim(footprint).slots
         self._fade(record.stamp_s)  # from here on nothing fails
-        slots = self._registry.visible(footprint).slots
         if len(slots):
             self._integrate(Scan(image, record.T_world_camera, footprint, slots))
             self._pool.revision += 1

@@ -19,7 +19,7 @@ from taichi_mrf.kernels.log_odds import logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.survey import Answers, Medium, Occlusion, SurfaceSurvey, occlusion, survey_rays
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.noise import CameraNoise, NoiseTable
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
@@ -170,7 +170,7 @@ class View:
         T_world_camera: Pose,
         max_depth: float,
         measured_m: NDArray[np.float32],
-        noise: NoiseTable,
+        noise: CameraNoise,
         predicting: bool = False,
     ) -> SurfaceSurvey:
         """Follow the rays of those pixels of (H, W) ``measured_m`` that are not 0, up to ``max_depth``.
@@ -189,7 +189,7 @@ class View:
         learnt: float,
         rule: Occlusion,
         measured_m: NDArray[np.float32] | None,
-        noise: NoiseTable,
+        noise: CameraNoise,
     ) -> SurfaceSurvey:
         near, far, visibility, expected, likelihood = np.zeros((5, *camera.shape), np.float32)
         visibility[:] = 1.0

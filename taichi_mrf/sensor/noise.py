@@ -8,9 +8,9 @@ patch of pixels (MRFMap, section IV-C).
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,12 +20,11 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
-from taichi_mrf.sensor.stored import Arrays, Stored, read_stored
+from taichi_mrf.sensor.stored import Arrays, Stored, read_stored, stored_arrays
 from taichi_mrf.system.later import later
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.model import Sensor
-    from taichi_mrf.sensor.polynomials import SensorNoise
     from taichi_mrf.system import npz_file
 else:
     (npz_file,) = later("taichi_mrf.system", "npz_file")
@@ -39,9 +38,22 @@ Curves = tuple[NDArray[np.float64], NDArray[np.float64]]
 """sigma (at least LEAST_SIGMA_M) and bias at depths (n,), a row for each kind of pixel."""
 
 
+class CameraNoise(Protocol):
+    """The noise of one camera's pixels, of any class; that of polynomials is NoiseTable."""
+
+    def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """sigma (at least LEAST_SIGMA_M) and bias, (H, W) each, for surfaces at (H, W) axial depths."""
+
+    def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The largest sigma and the largest absolute bias that any pixel has at each of some depths, (N,)."""
+
+    def sensor(self, camera: Camera) -> "Sensor":
+        """A camera with this noise as kernels take it."""
+
+
 @dataclass(frozen=True)
 class NoiseTable:
-    """Noise in the form that kernels read.
+    """Noise in the form that kernels read: polynomials.
 
     ``coefficients`` is (patches, 2, TERMS) float32: sigma, then bias, ascending powers of axial depth.
     Pixel (u, v) belongs to patch (v // patch) * columns + u // patch.
@@ -52,40 +64,56 @@ class NoiseTable:
     columns: int
 
     def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """sigma (at least LEAST_SIGMA_M) and bias, (H, W) each, for surfaces at (H, W) axial depths."""
         v, u = np.indices(depth_m.shape)
         row = (v // self.patch) * self.columns + u // self.patch
         sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
         return np.maximum(sigma, LEAST_SIGMA_M), bias
 
     def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The largest sigma and the largest absolute bias that any pixel has at each of some depths, (N,)."""
         values = np.abs(evaluate(self.coefficients[:, :, None], depth_m.reshape(1, 1, -1)))
         return np.maximum(values[:, 0], LEAST_SIGMA_M).max(axis=0), values[:, 1].max(axis=0)
 
-    def in_kernels(self) -> "SensorNoise":
-        """The table as kernels take it: a polynomials.PolynomialTable."""
+    def sensor(self, camera: Camera) -> "Sensor":
         from taichi_mrf.kernels.resident import resident
+        from taichi_mrf.sensor.model import Sensor
         from taichi_mrf.sensor.polynomials import PolynomialTable
 
-        return PolynomialTable(resident(self.coefficients), self.patch, self.columns)
+        table = PolynomialTable(resident(self.coefficients), self.patch, self.columns)
+        return Sensor(camera.in_kernels(), table)
+
+
+@dataclass(frozen=True)
+class ScaledNoiseTable:
+    """The noise ``of`` pixels, whose sigma is multiplied by ``scale``, float32 (H, W), or (1, 1) for all of
+    them, before ``added_m`` metres are added."""
+
+    of: CameraNoise
+    scale: NDArray[np.float32]
+    added_m: float
+
+    def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        sigma, bias = self.of.at_pixels(depth_m)
+        return np.maximum(sigma * self.scale + self.added_m, LEAST_SIGMA_M), bias
+
+    def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        sigma, bias = self.of.largest(depth_m)
+        largest = sigma * float(self.scale.max(initial=1.0)) + self.added_m
+        return np.maximum(largest, LEAST_SIGMA_M), bias
 
     def sensor(self, camera: Camera) -> "Sensor":
-        """A camera with this noise as kernels take it."""
-        from taichi_mrf.sensor.model import Sensor
+        from taichi_mrf.kernels.resident import resident
+        from taichi_mrf.sensor.polynomials import ScaledTable
 
-        return Sensor(camera.in_kernels(), self.in_kernels())
+        sensor, patch = self.of.sensor(camera), 1 if self.scale.shape == camera.shape else max(camera.shape)
+        parts = resident(self.scale.reshape(-1)), patch, self.scale.shape[1], self.added_m
+        return replace(sensor, noise=ScaledTable(sensor.noise, *parts))
 
 
 @runtime_checkable
 class NoiseModel(Protocol):
-    """Interface of a noise model, as MRFMap needs it.
+    """Interface of a noise model, as MRFMap needs it."""
 
-    What :meth:`table` returns may be of any class with the methods ``at_pixels``, ``largest`` and ``sensor``
-    of NoiseTable, and need not hold polynomials.
-    """
-
-    def table(self, camera: Camera) -> NoiseTable:
+    def table(self, camera: Camera) -> CameraNoise:
         """The noise of one camera's pixels. Raises ConfigError if the model does not fit the camera."""
 
 
@@ -96,7 +124,7 @@ class StoredNoise(Stored):
     bias: NDArray[np.float64]
 
     @abstractmethod
-    def table(self, camera: Camera) -> NoiseTable:
+    def table(self, camera: Camera) -> CameraNoise:
         """As NoiseModel has it."""
 
     def curves(self, depth_m: NDArray[np.float64]) -> Curves:
@@ -178,6 +206,30 @@ class PatchNoise(StoredNoise):
         return _table(self.sigma, self.bias, self.patch, self.columns)
 
 
+class WidenedNoise(StoredNoise):
+    """A noise model of any class with another sigma. ``law`` (2) holds metres that are added to the model's,
+    and the factor on it."""
+
+    def __init__(self, noise: NoiseModel, law: NDArray[np.float64]) -> None:
+        self.noise, self.law = noise, law
+
+    def table(self, camera: Camera) -> ScaledNoiseTable:
+        added_m, scale = self.law.tolist()
+        return ScaledNoiseTable(self.noise.table(camera), np.full((1, 1), scale, np.float32), added_m)
+
+    def curves(self, depth_m: NDArray[np.float64]) -> Curves:
+        sigma, bias = cast(StoredNoise, self.noise).curves(depth_m)
+        return np.maximum(self.law[1] * sigma + self.law[0], LEAST_SIGMA_M), bias
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Its law, and the arrays of its model. Raises MapFileError if that cannot be saved."""
+        return {"law": self.law, **stored_arrays(self.noise, "of_")}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "WidenedNoise":
+        return cls(file.stored("of_"), file.array("law", "f", (2,)))
+
+
 def load_noise(path: str | Path) -> StoredNoise:
     """The noise model of an .npz with its ``stored_arrays``. Raises ConfigError, which names the file."""
     with npz_file.open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
@@ -247,8 +299,7 @@ def widened(sigma: NDArray[np.float64], config: SensorConfig) -> NDArray[np.floa
 
 
 def widened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
-    """A noise model that was stated as an object, with the same. Models of other classes than those of this
-    file stay as they are."""
+    """A noise model that was stated as an object, with the same."""
     if config.sigma_scale == 1 and config.sigma_added == 0:
         return noise
     return _with_sigma(noise, lambda sigma: widened(sigma, config))
@@ -266,12 +317,14 @@ def unwidened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
 
 
 def _with_sigma(noise: Any, change: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Any:
-    """A noise model with other coefficients of sigma."""
+    """A noise model with other coefficients of sigma: of depth, else of the sigma of a class of its own."""
     if isinstance(noise, PatchNoise):
         return PatchNoise(change(noise.sigma), noise.bias, noise.patch, noise.camera)
     if isinstance(noise, PolynomialNoise):
         return PolynomialNoise(change(noise.sigma)[0].tolist(), noise.bias[0].tolist())
-    return noise
+    of, law = (noise.noise, noise.law) if isinstance(noise, WidenedNoise) else (noise, np.array([0.0, 1.0]))
+    law = change(law)
+    return of if law.tolist() == [0.0, 1.0] else WidenedNoise(of, law)
 
 
 def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[np.float64]:
@@ -288,10 +341,17 @@ def _curves(sigma: NDArray[np.float64], bias: NDArray[np.float64], depth_m: NDAr
     return np.maximum(values, LEAST_SIGMA_M), means
 
 
-def without_bias(depth_m: NDArray[np.floating], table: NoiseTable) -> NDArray[np.float64]:
+def _unscaled(table: CameraNoise) -> CameraNoise:
+    """The noise whose sigma was scaled; its bias was not."""
+    while isinstance(table, ScaledNoiseTable):
+        table = table.of
+    return table
+
+
+def without_bias(depth_m: NDArray[np.floating], table: CameraNoise) -> NDArray[np.float64]:
     """The depths of the surfaces that give measured depths (H, W) on average; 0 where nothing was
     measured."""
-    measured = np.isfinite(depth_m) & (depth_m > 0)
+    table, measured = _unscaled(table), np.isfinite(depth_m) & (depth_m > 0)
     z = np.where(measured, depth_m, 0.0).astype(np.float64)
     if isinstance(table, NoiseTable) and not table.coefficients[:, 1].any():
         return z
@@ -301,12 +361,13 @@ def without_bias(depth_m: NDArray[np.floating], table: NoiseTable) -> NDArray[np
     return z
 
 
-def warn_of_bad_sigma(table: NoiseTable, min_depth: float, max_depth: float) -> None:
+def warn_of_bad_sigma(table: CameraNoise, min_depth: float, max_depth: float) -> None:
     """Warn, naming the patch, if sigma falls to zero or below somewhere in the working range.
 
     Kernels clamp it at LEAST_SIGMA_M, so that a badly fitted patch is merely trusted a lot. Noise that is not
     made of polynomials is left alone.
     """
+    table = _unscaled(table)
     if not isinstance(table, NoiseTable):
         return
     depths = np.linspace(min_depth, max_depth, 100)

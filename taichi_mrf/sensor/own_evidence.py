@@ -11,7 +11,7 @@ from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
-from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.noise import NoiseModel, WidenedNoise
 from taichi_mrf.sensor.pixel_sigma import PixelSigma
 from taichi_mrf.sensor.pose_doubt import Covariance, DoubtfulPose, checked_covariance
 
@@ -61,8 +61,11 @@ class OwnEvidence:
     def content(self) -> bytes:
         """The evidence as bytes to sort by; empty if there is none. Images are none: no marginal depends on
         them."""
-        noise = self.noise
-        parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
+        noise, parts = self.noise, list[bytes]()
+        if isinstance(noise, WidenedNoise):
+            parts, noise = [noise.law.tobytes()], noise.noise
+        if noise is not None:
+            parts += [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
         arrays = (self.sigma_m, self.no_return, self.pose_covariance)
         images = (array.tobytes() for array in arrays if array is not None)
         return b"".join([*parts, *images])

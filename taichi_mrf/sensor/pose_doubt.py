@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.errors import KeyframeError
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+from taichi_mrf.sensor.noise import CameraNoise, NoiseModel, ScaledNoiseTable
 from taichi_mrf.sensor.origins import points_at
-from taichi_mrf.sensor.pixel_sigma import ScaledNoiseTable
+from taichi_mrf.sensor.pixel_sigma import sigma_to_scale
 
 Covariance = NDArray[np.float64]
 Image = NDArray[np.float64]
@@ -185,7 +185,7 @@ def _dot(a: Image, b: Image) -> Image:
 class DoubtfulNoiseTable(ScaledNoiseTable):
     """A sensor's noise, scaled so that at the measured depths it has the pose's share, at most ``most_m``."""
 
-    of_sensor: NoiseTable
+    of_sensor: CameraNoise
     most_m: float
 
     def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -195,22 +195,15 @@ class DoubtfulNoiseTable(ScaledNoiseTable):
 
 
 def doubtful_table(
-    table: NoiseTable, depth_m: NDArray[np.floating], camera: Camera, covariance: Covariance
+    table: CameraNoise, depth_m: NDArray[np.floating], camera: Camera, covariance: Covariance
 ) -> DoubtfulNoiseTable:
     """The noise of an image's pixels for a covariance (6, 6) of its pose; ``table`` is the sensor's alone.
-    Raises ConfigError if that is not made of polynomials."""
-    if not isinstance(table, NoiseTable):
-        raise ConfigError(
-            "pose_covariance needs polynomial noise, which this keyframe does not have: leave out "
-            "pose_covariance, or add the keyframe with noise=PolynomialNoise(...)"
-        )
+    Raises ConfigError if its sigma cannot be scaled."""
     of_pose = depth_sigma(depth_m, camera, covariance)
-    sigma, _ = table.at_pixels(depth_m)
-    scale = np.hypot(1.0, of_pose / sigma)
-    if isinstance(table, ScaledNoiseTable):
-        scale *= table.scale
-    parts = (table.coefficients, table.patch, table.columns, scale.astype(np.float32))
-    return DoubtfulNoiseTable(*parts, table, float(of_pose.max(initial=0.0)))
+    of, scale = table, np.hypot(1.0, of_pose / sigma_to_scale(table, depth_m))
+    if isinstance(table, ScaledNoiseTable) and table.added_m == 0:
+        of, scale = table.of, scale * table.scale
+    return DoubtfulNoiseTable(of, scale.astype(np.float32), 0.0, table, float(of_pose.max(initial=0.0)))
 
 
 @dataclass(frozen=True)
@@ -222,6 +215,6 @@ class DoubtfulPose:
     depth_m: NDArray[np.floating]
 
     def table(self, camera: Camera) -> DoubtfulNoiseTable:
-        """The noise of the image's pixels. Raises ConfigError if the model does not fit the camera, or is not
-        made of polynomials."""
+        """The noise of the image's pixels. Raises ConfigError if the model does not fit the camera, or if its
+        sigma cannot be scaled."""
         return doubtful_table(self.noise.table(camera), self.depth_m, camera, self.covariance)

@@ -49,6 +49,10 @@ class Arrays:
         """As NpzFile has it."""
         return self._file.array(self._prefix + name, kinds, shape)
 
+    def stored(self, prefix: str) -> Any:
+        """As :func:`read_stored` has it, of the arrays whose names begin with ``prefix``."""
+        return read_stored(self._file, self._prefix + prefix)
+
 
 _KIND = "kind"
 

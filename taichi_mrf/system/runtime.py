@@ -129,6 +129,11 @@ def is_software() -> bool:
     return _chosen is not None and _chosen.software
 
 
+def on_gpu() -> bool:
+    """True if kernels run on a GPU: not on a processor, by a software device or without one."""
+    return active() in ("cuda", "vulkan") and not is_software()
+
+
 def settle() -> None:
     """Wait for the kernels in flight, on Vulkan.
 

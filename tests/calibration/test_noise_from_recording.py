@@ -1,11 +1,12 @@
 """Sigma that is learnt from the recording itself, against simulated noise of a known sigma."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from plugged_noise import PixelNoise
+from plugged_noise import PixelNoise, SquareNoise
 
 from taichi_mrf import open_dataset
 from taichi_mrf.calibration import from_recording
@@ -34,6 +35,9 @@ from taichi_mrf.evaluation.noise_fit import (
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
+from taichi_mrf.sensor.stored import stored_arrays
+from taichi_mrf.system.atomic import write_npz
 
 VOXEL = 0.05
 
@@ -137,19 +141,44 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
         learn_sigma(chosen(room, [0, 1]), Config(VOXEL))
 
 
-class OfPixels(Derived):
-    """A recording whose frames have a noise that is no polynomial in depth."""
+@dataclass
+class Stating(Derived):
+    """A recording whose frames state a noise."""
+
+    noise: NoiseModel = field(kw_only=True)
 
     def read(self, index: int) -> Frame:
-        frame = self.source.read(index)
-        return replace(frame, noise=PixelNoise(np.full(frame.depth_m.shape, 0.02, np.float32)))
+        return replace(self.source.read(index), noise=self.noise)
 
 
 @pytest.mark.usefixtures("one_backend")
-def test_a_noise_that_is_no_polynomial_is_the_reason_that_is_said(room: Dataset) -> None:
-    dataset = OfPixels("walk", room.camera, source=room)
-    with pytest.raises(DatasetError, match=r"noise PixelNoise of frame .* is not made of polynomials"):
-        learn_sigma(dataset, Config(VOXEL))
+def test_a_file_of_a_class_is_learnt_as_one_of_the_same_polynomial(room: Dataset, tmp_path: Path) -> None:
+    least_m, growth = 2.0**-9, 2.0**-13  # too small; as float32 the same
+    found = []
+    for noise in (SquareNoise(least_m, growth), PolynomialNoise((least_m, 0.0, growth))):
+        write_npz(tmp_path / "noise.npz", stored_arrays(noise))
+        sensor = SensorConfig(sigma_table=str(tmp_path / "noise.npz"))
+        found.append(learn_sigma(room, Config(VOXEL, sensor=sensor)))
+    of_class, of_values = found
+    assert of_class.factor > CONTRADICTED
+    assert of_class.law != SigmaLaw(1.0, 0.0)
+    for name in ("factor", "before", "after"):
+        assert getattr(of_class, name) == pytest.approx(getattr(of_values, name), rel=1e-6)
+    assert of_class.law.scale == pytest.approx(of_values.law.scale, rel=1e-6)
+    assert of_class.law.added_m == pytest.approx(of_values.law.added_m, abs=1e-6)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_sigma_of_each_pixel_is_learnt(room: Dataset) -> None:
+    """Of 2 mm, a Kinect's at the depths of the room being several times as much."""
+    noise = PixelNoise(np.full(room.camera.shape, 0.002, np.float32))
+    found = learn_sigma(Stating("walk", room.camera, source=room, noise=noise), Config(VOXEL))
+    depths = np.concatenate([f.depth_m[f.depth_m > 0] for f in (room.read(i) for i in range(len(room)))])
+    true_m = float(np.polynomial.polynomial.polyval(np.median(depths), SensorConfig().sigma))
+    found_m, voxel_m = found.law.scale * 0.002 + found.law.added_m, VOXEL_SPREAD * VOXEL
+    assert found.after > found.before
+    assert true_m / CLOSE < math.hypot(found_m, voxel_m) < CLOSE * math.hypot(true_m, voxel_m)
+    assert abs(math.log(found_m / true_m)) < abs(math.log(0.002 / true_m))
 
 
 @pytest.mark.parametrize(("factor", "gain", "said"), [(3.4, 0.012, 1), (3.4, 0.003, 0), (2.5, 0.012, 0)])

@@ -12,8 +12,8 @@ from taichi_mrf.datasets.laser.floor_plan_scans import (
     FloorPlanOptions,
     building,
     poses_along,
+    robot_path,
     simulate_scans,
-    way,
 )
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
@@ -74,7 +74,7 @@ def test_a_pillar_and_a_wall_by_geometry(x: float, y: float, angle: float, radiu
 
 
 def test_the_way_leads_through_every_room_and_no_wall() -> None:
-    points = poses_along(way(), 4000)[:, :2]
+    points = poses_along(robot_path(), 4000)[:, :2]
     assert not BUILDING.solid(points).any()
     around = np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=-1) * 0.25
     assert not BUILDING.solid((points[:, None] + around).reshape(-1, 2)).any()

@@ -13,7 +13,7 @@ from taichi_mrf.evaluation.pictures.laser_pictures import (
 )
 from taichi_mrf.factor_graph.solve import METHODS
 
-WAY = np.array([[0.0, 0.0], [0.5, 0.2], [1.0, 0.0]])
+PATH = np.array([[0.0, 0.0], [0.5, 0.2], [1.0, 0.0]])
 
 
 def a_map(marginals: bool = False) -> LaserMap:
@@ -30,7 +30,7 @@ def test_a_map_knows_where_it_lies() -> None:
 
 @pytest.mark.parametrize("marginals", [False, True])
 def test_dark_is_occupied_and_grey_unknown(marginals: bool) -> None:
-    axes = map_figure(a_map(marginals), WAY, "a map").axes[0]
+    axes = map_figure(a_map(marginals), PATH, "a map").axes[0]
     (image,) = axes.get_images()
     shown = np.asarray(image.get_array())
     assert shown[0, 2] == pytest.approx(0.8)
@@ -38,7 +38,7 @@ def test_dark_is_occupied_and_grey_unknown(marginals: bool) -> None:
     assert shown[1, 1] == pytest.approx(0.75 if marginals else 1.0)
     assert tuple(image.get_extent()) == (-1.0, 0.5, 1.5, 2.5)
     assert image.origin == "lower"
-    assert np.array_equal(axes.get_lines()[0].get_xydata(), WAY)
+    assert np.array_equal(axes.get_lines()[0].get_xydata(), PATH)
     assert axes.get_title() == "a map"
 
 
@@ -75,9 +75,9 @@ def test_figures_of_nothing_can_be_drawn() -> None:
 
 @pytest.mark.parametrize("plan", [None, FloorPlan(np.eye(4, dtype=bool), (0.0, 0.0), (0.5, 0.5))])
 def test_all_maps_stand_beside_the_plan(plan: FloorPlan | None) -> None:
-    figure = comparison_figure({method: a_map() for method in METHODS}, WAY, plan)
+    figure = comparison_figure({method: a_map() for method in METHODS}, PATH, plan)
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles[0] == ("way of the robot" if plan is None else "floor plan and way")
+    assert titles[0] == ("path of the robot" if plan is None else "floor plan and path")
     assert titles[1:] == [METHOD_NAMES[method] for method in METHODS]
     assert len(figure.axes[0].get_images()) == (0 if plan is None else 1)
     assert all(axes.get_xlim() == (-1.0, 0.5) for axes in figure.axes)

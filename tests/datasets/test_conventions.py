@@ -117,7 +117,7 @@ def test_late_poses_are_those_stamped_later(tmp_path: Path) -> None:
 
 
 def test_late_poses_are_interpolated_in_their_own_times(tmp_path: Path) -> None:
-    """Poses at ten times the rate of the images, on a way that bends between two images."""
+    """Poses at ten times the rate of the images, on a path that bends between two images."""
     content = Content()
     folder = write_tum(tmp_path / "recording", content)
     stamps = np.array(open_dataset(folder, camera=CAMERA).stamps())

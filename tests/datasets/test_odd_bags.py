@@ -54,7 +54,7 @@ T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]
 
 
 def in_map(bag: Bag) -> None:
-    """Clouds that were moved to the frame map from the place of the body, and its way by tf."""
+    """Clouds that were moved to the frame map from the place of the body, and its path by tf."""
     for i in range(COUNT):
         T = T_MAP_ODOM @ world_body(i)
         bag_clouds.send(bag, stamp(i), bag_clouds.points(i) @ T[:3, :3].T + T[:3, 3], frame="map")
@@ -369,7 +369,7 @@ def test_stamps_that_are_right_stay_and_wrong_ones_are_found(
 
 @pytest.mark.parametrize("poses", [odometry, moving_tf])
 def test_late_poses_are_interpolated_in_their_own_times(make: Make, poses: Callable[..., None]) -> None:
-    """The body goes a way that bends between two images; its poses are stamped .05 s late."""
+    """The body goes a path that bends between two images; its poses are stamped .05 s late."""
 
     def dense(bag: Bag) -> None:
         poses(bag, late=0.05, numbers=np.arange(-1, COUNT, 0.1).tolist())

@@ -358,7 +358,7 @@ def offset(*metres: float) -> Pose:
     return T
 
 
-def way(T_fixed_odom: Pose) -> dict[float, Pose]:
+def camera_path(T_fixed_odom: Pose) -> dict[float, Pose]:
     """The camera's poses by their stamps."""
     return {stamp(i): T_fixed_odom @ world_body(i) @ T_body_camera for i in range(COUNT)}
 
@@ -415,15 +415,15 @@ def test_a_transform_that_jumps_moves_all_earlier_poses(make: Make) -> None:
     path = make(images, mounted, moving_tf, corrected, in_earth, kind="sqlite")
     source = open_pose_source(f"{path}?pose=tf&frame=map")
     for now, T_map_odom in ((stamp(1), before), (stamp(4), jump)):
-        assert_poses(source.poll(START + now), way(T_map_odom))
+        assert_poses(source.poll(START + now), camera_path(T_map_odom))
     assert source.poll(float("inf")) is None
     earth = open_pose_source(f"{path}?pose=tf").poll(float("inf"))
-    assert_poses(earth, way(offset(0.2, -0.1, 7.0)))
+    assert_poses(earth, camera_path(offset(0.2, -0.1, 7.0)))
 
 
 def test_a_topic_of_single_poses_does_not_change(make: Make) -> None:
     source = open_pose_source(make(plain))
-    assert_poses(source.poll(float("-inf")), way(np.eye(4)))
+    assert_poses(source.poll(float("-inf")), camera_path(np.eye(4)))
     assert source.poll(float("inf")) is None
 
 

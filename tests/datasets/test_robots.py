@@ -116,11 +116,10 @@ def test_an_image_whose_pose_does_not_come_is_left_out(begin: Begin, monkeypatch
     assert wait_until(lambda: came(live) == COUNT, SECONDS)
     assert live.read(0).name == f"{COUNT - 2:06d}"
     assert "left out" not in live.awaiting()
-    static = next(data for topic, _, data in sender.messages if topic == "/tf_static")
     monkeypatch.setattr(stream, "LATE_S", 0.1)
 
     def is_left_out() -> bool:
-        sender.channels["/tf_static"].log(static)
+        sender.send_again("/tf_static")
         return "1 left out: no poses within 0.1 s" in live.awaiting()
 
     assert wait_until(is_left_out, SECONDS)
@@ -250,6 +249,42 @@ def test_clouds_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> Non
         np.testing.assert_array_equal(ours.no_return, theirs.no_return)
         np.testing.assert_array_equal(ours.points_m, theirs.points_m)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+
+
+def test_a_cloud_waits_for_the_pose_of_its_last_point_through_a_pause(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "LATE_S", 0.0)
+    sender, live, bag = begin(LIDARS["rows with times"], first=5)
+    recorded = open_dataset(bag)
+    found = one_by_one(sender, live, pause_s=live.gap + 0.05)
+    assert len(found) == bag_clouds.SCANS
+    for ours, theirs in zip(found, recorded, strict=True):
+        np.testing.assert_array_equal(ours.points_m, theirs.points_m)
+
+
+def test_a_cloud_is_left_out_where_poses_end_before_its_last_point(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seconds = np.tile(np.linspace(0.0, 0.08, WIDTH, dtype=np.float32), (4, 1))
+
+    def scans(bag: Bag) -> None:
+        for at in (1.0, 3.0):
+            bag_clouds.send(bag, at, bag_clouds.points(0), time=seconds)
+        for at in (0.9, 0.95, 1.0, 1.05):
+            bag.odometry("/odom", at, "odom", "body", bag_clouds.pose(at))
+        bag.tf("/tf_static", 0.0, "body", bag_clouds.LIDAR, bag_clouds.T_BODY_LIDAR)
+
+    sender, live, _ = begin(scans)
+    assert wait_until(lambda: came(live) == 2, SECONDS)
+    monkeypatch.setattr(stream, "LATE_S", 0.1)
+
+    def is_decided() -> bool:
+        sender.send_again("/tf_static")
+        return not live.awaiting() or "2 left out" in live.awaiting()
+
+    assert wait_until(is_decided, SECONDS)
+    assert "2 left out: no poses within 0.1 s" in live.awaiting()
 
 
 def test_each_image_has_the_camera_of_its_time(begin: Begin) -> None:

@@ -104,7 +104,7 @@ def test_depth_has_what_is_near_it_where_other_topics_fall_silent(
     monkeypatch.setattr(stream, "LATE_S", 0.1)
 
     def is_there() -> bool:
-        sender.send("/tf_static")
+        sender.send_again("/tf_static")
         return not live.awaiting()
 
     assert wait_until(is_there, SECONDS)

@@ -16,7 +16,7 @@ from taichi_mrf.datasets.synthetic.corridor import (
     HALF_WIDTH,
     OVERLAP_M,
     Room,
-    SmoothWay,
+    SmoothPath,
     corridor_length,
     corridor_scene,
     waypoints,
@@ -69,8 +69,8 @@ def test_rooms_differ_and_the_way_ends_at_the_other_end() -> None:
         for n in range(12)
     ]
     assert len(set(kinds)) >= 5
-    way = waypoints(12)
-    assert way[0, 0] < 1 < corridor_length(12) - 1 < way[-1, 0]
+    path = waypoints(12)
+    assert path[0, 0] < 1 < corridor_length(12) - 1 < path[-1, 0]
 
 
 @pytest.mark.parametrize("rooms", [1, 2, 3])
@@ -101,11 +101,11 @@ RING = "synthetic:ring?frames=60&width=80&height=60&noise=none"
 @pytest.mark.parametrize("length", [24, 60])
 def test_the_camera_keeps_clear_and_comes_back(length: int) -> None:
     ring = open_dataset(f"{RING}&length={length}")
-    poses = [ring.way.pose_at(metres) for metres in np.arange(0.0, ring.way.length_m, 0.1)]
+    poses = [ring.camera_path.pose_at(metres) for metres in np.arange(0.0, ring.camera_path.length_m, 0.1)]
     assert ring.signed_distance([T[:3, 3] for T in poses]).min() > 0.3
-    assert 0.9 * (length + OVERLAP_M) < ring.way.length_m < length + OVERLAP_M
+    assert 0.9 * (length + OVERLAP_M) < ring.camera_path.length_m < length + OVERLAP_M
     # The last metres are the first ones once more, in the same direction.
-    again = [tangent_norms(T, ring.way.pose_at(OVERLAP_M - 0.5)) for T in poses[-10:]]
+    again = [tangent_norms(T, ring.camera_path.pose_at(OVERLAP_M - 0.5)) for T in poses[-10:]]
     assert min(shifted for _, shifted in again) < 0.2
     assert min(turned for turned, _ in again) < 0.6
     assert np.ptp([T[:3, 3] for T in poses], axis=0)[:2].min() > length / 6 - 1
@@ -117,17 +117,17 @@ def test_the_camera_keeps_clear_and_comes_back(length: int) -> None:
 
 
 def test_a_way_goes_where_its_corners_are_and_rounds_them() -> None:
-    way = SmoothWay([(0.0, 0.0), (10.0, 0.0), (10.0, 8.0)], rounding_m=2.0, floor_z=-1.0)
-    begin, end = way.pose_at(0.0), way.pose_at(way.length_m)
+    path = SmoothPath([(0.0, 0.0), (10.0, 0.0), (10.0, 8.0)], rounding_m=2.0, floor_z=-1.0)
+    begin, end = path.pose_at(0.0), path.pose_at(path.length_m)
     np.testing.assert_allclose(begin[:2, 3], [0, 0], atol=0.05)
     np.testing.assert_allclose(end[:2, 3], [10, 8], atol=0.05)
-    assert 17 < way.length_m < 18
+    assert 17 < path.length_m < 18
     # In the middle of the first side it walks along x, upright, 1.5 m over the floor.
-    middle = way.pose_at(5.0)
+    middle = path.pose_at(5.0)
     assert middle[2, 3] == pytest.approx(0.5, abs=0.04)
     assert middle[0, 2] > 0.9
     assert middle[2, 1] < -0.95
-    corner = min(np.linalg.norm(way.pose_at(s)[:2, 3] - (10, 0)) for s in np.arange(9, 11, 0.05))
+    corner = min(np.linalg.norm(path.pose_at(s)[:2, 3] - (10, 0)) for s in np.arange(9, 11, 0.05))
     assert 0.05 < corner < 0.5
 
 

@@ -53,12 +53,12 @@ def tracked(walk: list[Frame]) -> tuple[list[Pose], list[int]]:
 
 def test_colour_shows_the_way_along_a_flat_wall() -> None:
     walk = [along_the_wall(i) for i in range(8)]
-    way = np.array([frame.T_world_camera[:3, 3] for frame in walk])
+    path = np.array([frame.T_world_camera[:3, 3] for frame in walk])
     poses, directions = tracked(walk)
-    assert np.abs(np.array(poses)[:, :3, 3] - way).max() < 0.005
+    assert np.abs(np.array(poses)[:, :3, 3] - path).max() < 0.005
     assert directions == [6] * 8
     lost, undetermined = tracked(blind(walk))
-    assert np.abs(np.array(lost)[:, :3, 3] - way).max() > 0.1
+    assert np.abs(np.array(lost)[:, :3, 3] - path).max() > 0.1
     assert max(undetermined[1:]) == 3
 
 
@@ -83,9 +83,9 @@ def test_colours_are_read_where_they_are_tracked() -> None:
 def test_steps_that_change_along_a_wall_are_followed() -> None:
     """Neither standing still nor going on as before is near where the camera is."""
     walk = [along_the_wall(i) for i in (0, 5, 2, 9, 6, 12)]
-    way = np.array([frame.T_world_camera[:3, 3] for frame in walk])
+    path = np.array([frame.T_world_camera[:3, 3] for frame in walk])
     poses, _ = tracked(walk)
-    assert np.abs(np.array(poses)[:, :3, 3] - way).max() < 0.01
+    assert np.abs(np.array(poses)[:, :3, 3] - path).max() < 0.01
 
 
 def test_where_flow_misleads_the_other_guesses_count() -> None:

@@ -61,19 +61,19 @@ def test_asking_remembers_nothing() -> None:
 
 
 @given(
-    way=st.lists(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5)), min_size=1, max_size=12),
+    path=st.lists(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5)), min_size=1, max_size=12),
     rotation=st.floats(0.05, 2.0),
     translation=st.floats(0.05, 2.0),
 )
 def test_planar_motion_against_plain_arithmetic(
-    way: list[tuple[float, float]], rotation: float, translation: float
+    path: list[tuple[float, float]], rotation: float, translation: float
 ) -> None:
     kept: list[int] = []
-    for index, (x, yaw) in enumerate(way):
-        gaps = [(abs(yaw - way[k][1]), abs(x - way[k][0])) for k in kept[-1:]]
+    for index, (x, yaw) in enumerate(path):
+        gaps = [(abs(yaw - path[k][1]), abs(x - path[k][0])) for k in kept[-1:]]
         if any(abs(turn - rotation) < 1e-6 or abs(move - translation) < 1e-6 for turn, move in gaps):
             return  # too close to the threshold for two ways of computing to agree
         if all(turn > rotation or move > translation for turn, move in gaps):
             kept.append(index)
     config = KeyframeConfig(rotation=rotation, translation=translation)
-    assert selected(config, [pose(x, yaw) for x, yaw in way]) == kept
+    assert selected(config, [pose(x, yaw) for x, yaw in path]) == kept

@@ -25,7 +25,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 DRIFT_M, DRIFT_RAD = 0.08, 0.02
-"""Largest error of the way along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
+"""Largest error of the path along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
 
 
 def names_of(told: list[Event], kind: type) -> list[str]:
@@ -47,9 +47,9 @@ def test_a_carried_camera_is_followed_through_the_room() -> None:
     off = errors(found)
     assert off[:, 0].max() < DRIFT_RAD
     assert off[:, 1].max() < DRIFT_M
-    way = [tangent_norms(tracked_room.true_pose(0), tracked_room.true_pose(i)) for i in range(COUNT)]
-    assert max(way)[0] > 1.0
-    assert max(metres for _, metres in way) > 1.0
+    path = [tangent_norms(tracked_room.true_pose(0), tracked_room.true_pose(i)) for i in range(COUNT)]
+    assert max(path)[0] > 1.0
+    assert max(metres for _, metres in path) > 1.0
     # Keyframes are a part of the frames, and stand where those were taken.
     assert 3 < len(result.map.keyframes) < COUNT / 2
     by_name = {frame.name: frame for frame in result.track.frames.values()}

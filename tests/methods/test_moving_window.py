@@ -170,7 +170,7 @@ def test_what_waits_for_older_keyframes_leaves_with_its_chunk(tmp_path: Path) ->
     np.testing.assert_allclose(occupancy, other.occupancy(in_memory), atol=1e-4)
 
 
-def test_memory_is_bounded_on_a_long_way(tmp_path: Path) -> None:
+def test_memory_is_bounded_on_a_long_path(tmp_path: Path) -> None:
     m = windowed(tmp_path / "far.zarr")
     bricks = walk(m, [0.4 * step for step in range(60)])
     assert max(bricks[30:]) <= max(bricks[:30])

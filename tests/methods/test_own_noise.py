@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 from one_pixel import VOXEL, ExactMap, allocated, random_pose
 from oracles import inference as reference
 from oracles.forward import Noise
+from plugged_noise import PixelNoise, SquareNoise, UniformLaw
 
 from taichi_mrf.config.sections import InferenceConfig
-from taichi_mrf.errors import ConfigError
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.ray_list import RayBundler, block_of
@@ -28,14 +29,17 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.sensor.pose_doubt import covariance_of
 from taichi_mrf.tune.trial import judge
 from taichi_mrf.viewer.messages import Switch
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 BIASED = PolynomialNoise((0.01, 0.0, 0.006), (0.3,))
+PROBES = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))
 COARSE = PolynomialNoise((0.01, 0.0, 0.006), (0.01,))
 
 
@@ -226,12 +230,47 @@ def test_held_out_frames_are_judged_by_their_own_noise_and_aligned_by_it() -> No
     assert not np.array_equal(scores, m.ray_scores(*parts), equal_nan=True)
 
 
-class NoPolynomials:
-    def table(self, camera: object) -> object:
-        return object()
+@pytest.mark.parametrize(
+    ("make", "given"),
+    [
+        (MRFMap, {}),
+        (MRFMap, {"pose_covariance": covariance_of(0.02, 0.005)}),
+        (LogOddsMap, {}),
+        (VisibilityMap, {}),
+    ],
+    ids=["mrf", "mrf, doubtful poses", "log_odds", "visibility"],
+)
+def test_a_class_of_its_own_maps_as_the_polynomial_of_the_same_values(
+    make: type, given: dict[str, Any]
+) -> None:
+    """These are sums of powers of two, so that both round alike."""
+    least_m, growth, offset_m = 2.0**-7, 2.0**-8, 2.0**-6
+    found = []
+    for noise in (SquareNoise(least_m, growth, offset_m), PolynomialNoise((least_m, 0, growth), (offset_m,))):
+        m = make(small_room.VOXEL_SIZE)
+        for frame in (stating(0), stating(1)):
+            m.add_keyframe(
+                frame.depth_m, frame.T_world_camera, frame.camera,
+                noise=noise, sigma_m=frame.sigma_m, **given,
+            )  # fmt: skip
+        m.infer()
+        found.append(m.occupancy(PROBES))
+    assert np.std(found[0]) > 0.02
+    np.testing.assert_allclose(*found, atol=1e-6)
 
 
-def test_sigmas_need_polynomials() -> None:
-    frame = stating(0)
-    with pytest.raises(ConfigError, match="sigma_m needs polynomial noise, not NoPolynomials"):
-        small_room.add(MRFMap(0.1), replace(frame, noise=NoPolynomials()))  # type: ignore[arg-type]
+@pytest.mark.parametrize("law", [Sensor, UniformLaw])
+def test_a_sigma_of_each_pixel_leaves_the_law_of_measurements(law: type[Sensor]) -> None:
+    """A law with edges may round to the other side of one."""
+    found = []
+    for of_model, stated in ((2.0**-6, 2.0**-5), (2.0**-5, None), (2.0**-6, None)):
+        m = MRFMap(small_room.VOXEL_SIZE)
+        for frame in small_room.frames()[:2]:
+            noise = PixelNoise(np.full(frame.camera.shape, of_model, np.float32), law)
+            sigma_m = None if stated is None else np.full(frame.camera.shape, stated, np.float32)
+            parts = (frame.depth_m, frame.T_world_camera, frame.camera)
+            m.add_keyframe(*parts, noise=noise, sigma_m=sigma_m)
+        m.infer()
+        found.append(m.occupancy(PROBES))
+    stated_off, model_off = (np.abs(found[0] - other).mean() for other in found[1:])
+    assert stated_off < 1e-3 * model_off

@@ -53,7 +53,7 @@ def _look_up(noise: SensorNoise, width: I32, height: I32, out: AnyArray) -> None
 def per_pixel(table: NoiseTable, camera: PinholeCamera) -> NDArray[np.float32]:
     """Terms that kernels read for each pixel, (H, W, 2, TERMS): sigma, bias."""
     out = np.full((*camera.shape, 2, TERMS), np.nan, np.float32)
-    _look_up(table.in_kernels(), camera.width, camera.height, out)
+    _look_up(table.sensor(camera).noise, camera.width, camera.height, out)
     return out
 
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from plugged_noise import PixelNoise, SquareNoise
 
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32Array2, F32Array3
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise, WidenedNoise
 from taichi_mrf.sensor.own_evidence import OwnEvidence, checked_evidence, sigma_of_confidence
 from taichi_mrf.sensor.polynomials import SensorNoise
 
@@ -19,6 +20,14 @@ CAMERA = PinholeCamera(20, 12, 20.0, 20.0, 9.5, 5.5)
 PATCHES = PatchNoise(
     np.random.default_rng(0).uniform(0.01, 0.02, (6, 3)), np.full((6, 2), 0.005), patch=8, camera=CAMERA
 )
+OF_PIXELS = PixelNoise(np.linspace(0.005, 0.03, 240, dtype=np.float32).reshape(CAMERA.shape))
+MODELS = {
+    "polynomials": PATCHES,
+    "square": SquareNoise(0.01, 0.004, 0.005),
+    "of pixels": OF_PIXELS,
+    "widened": WidenedNoise(OF_PIXELS, np.array([0.004, 1.5])),
+}
+every_model = pytest.mark.parametrize("noise", MODELS.values(), ids=MODELS)
 
 
 def depths() -> NDArray[np.float32]:
@@ -32,10 +41,11 @@ def sigmas() -> NDArray[np.float32]:
     return np.where(rng.random(CAMERA.shape) < 0.3, 0.0, sigma).astype(np.float32)
 
 
-def test_sigma_holds_at_the_measured_depth_follows_the_models_law_and_leaves_the_bias() -> None:
+@every_model
+def test_sigma_holds_where_measured_follows_the_models_law_and_leaves_the_bias(noise: NoiseModel) -> None:
     depth, sigma = depths(), sigmas()
-    model = PATCHES.table(CAMERA)
-    table = OwnEvidence(None, sigma).noise_model(PATCHES, depth).table(CAMERA)
+    model = noise.table(CAMERA)
+    table = OwnEvidence(None, sigma).noise_model(noise, depth).table(CAMERA)
     for factor in (1.0, 0.8, 1.5):
         found, bias = table.at_pixels(factor * depth)
         of_model, bias_of_model = model.at_pixels(factor * depth)
@@ -58,16 +68,46 @@ def _noise_at(noise: SensorNoise, depth: F32Array2, out: F32Array3) -> None:
 
 
 @pytest.mark.usefixtures("backend")
-def test_kernels_read_the_same_noise() -> None:
+@every_model
+def test_kernels_read_the_same_noise(noise: NoiseModel) -> None:
     depth = depths()
-    table = OwnEvidence(None, sigmas()).noise_model(PATCHES, depth).table(CAMERA)
+    table = OwnEvidence(None, sigmas()).noise_model(noise, depth).table(CAMERA)
     out = np.zeros((*CAMERA.shape, 3), np.float32)
-    _noise_at(table.in_kernels(), depth, out)
+    _noise_at(table.sensor(CAMERA).noise, depth, out)
     sigma, bias = table.at_pixels(depth)
     np.testing.assert_allclose(out[..., 0], sigma, rtol=1e-5)
     np.testing.assert_allclose(out[..., 1], bias, rtol=1e-5)
     slope = (table.at_pixels(depth + 1e-3)[0] - table.at_pixels(depth - 1e-3)[0]) / 2e-3
-    np.testing.assert_allclose(out[..., 2], slope, rtol=1e-3)
+    np.testing.assert_allclose(out[..., 2], slope, rtol=1e-3, atol=1e-6)
+
+
+def test_the_content_of_a_widened_noise_is_that_of_its_model_and_law() -> None:
+    """Keyframes are sorted by it, so that it may not tell one object from another."""
+
+    def widened(added_m: float) -> OwnEvidence:
+        patches = PatchNoise(PATCHES.sigma, PATCHES.bias, 8, CAMERA)
+        return OwnEvidence(WidenedNoise(patches, np.array([added_m, 2.0])))
+
+    first, again, other = map(widened, (0.01, 0.01, 0.02))
+    assert first.content() == again.content()
+    assert first.content() not in (other.content(), OwnEvidence(PATCHES).content())
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, np.inf, np.nan])
+def test_a_sigma_that_no_factor_changes_is_refused(sigma_m: float) -> None:
+    """Where nothing was measured, or nothing is stated, it may be anything."""
+    depth, stated = np.full(CAMERA.shape, 2.0, np.float32), np.full(CAMERA.shape, 0.05, np.float32)
+    of_model = np.full(CAMERA.shape, 0.01, np.float32)
+    of_model[:, :3] = sigma_m
+    noise = PixelNoise(of_model)
+    why = rf"sigma of 36 pixels cannot be scaled: it is {sigma_m:g} m at a depth of 2 m; let at_pixels of "
+    with pytest.raises(ConfigError, match=why):
+        OwnEvidence(None, stated).noise_model(noise, depth).table(CAMERA)
+    with pytest.raises(ConfigError, match=why):
+        OwnEvidence(pose_covariance=0.01 * np.eye(6)).noise_model(noise, depth).table(CAMERA)
+    stated[:, :3] = 0.0
+    found, _ = OwnEvidence(None, stated).noise_model(noise, depth).table(CAMERA).at_pixels(depth)
+    np.testing.assert_allclose(found[:, 3:], 0.05, rtol=1e-6)
 
 
 def test_a_model_without_sigma_is_clamped_before_it_is_scaled() -> None:

@@ -6,13 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from plugged_noise import PixelNoise, SquareNoise
 
 from taichi_mrf.alignment.se3 import cross_matrix, moved
-from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
-from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.sensor.own_evidence import OwnEvidence, checked_evidence
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, WidenedNoise
+from taichi_mrf.sensor.own_evidence import checked_evidence
 from taichi_mrf.sensor.pose_doubt import beside_edges, checked_covariance, covariance_of, depth_sigma
 from taichi_mrf.sensor.ray_table import RayTable
 
@@ -29,7 +30,13 @@ LIDAR = RayTable(
         [np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION), np.cos(ELEVATION) * np.cos(AZIMUTH)], axis=-1
     )
 )
-NOISE = PolynomialNoise((0.005, 0.0, 0.002), (0.01,))
+SQUARE = SquareNoise(0.005, 0.002, 0.01)
+NOISES = {
+    "polynomial": PolynomialNoise((0.005, 0.0, 0.002), (0.01,)),
+    "square": SQUARE,
+    "of pixels": PixelNoise(np.linspace(0.004, 0.02, 432, dtype=np.float32).reshape(PINHOLE.shape)),
+    "widened": WidenedNoise(SQUARE, np.array([0.01, 2.0])),
+}
 
 
 def random_covariance(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -120,7 +127,8 @@ def test_pixels_beside_edges_are_those_that_nearer_points_reach(seed: int) -> No
     np.testing.assert_array_equal(beside_edges(depth, PINHOLE, covariance), expected & (depth > 0))
 
 
-def test_the_noise_of_a_doubtful_image_is_that_of_sensor_and_pose() -> None:
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+def test_the_noise_of_a_doubtful_image_is_that_of_sensor_and_pose(noise: NoiseModel) -> None:
     rng = np.random.default_rng(5)
     depth = depth_of_plane(PINHOLE, np.array([0.1, -0.2, 0.5])).astype(np.float32)
     depth[3, 4] = 0.0
@@ -130,18 +138,13 @@ def test_the_noise_of_a_doubtful_image_is_that_of_sensor_and_pose() -> None:
     for sigma_m in (None, stated):
         _, own = checked_evidence(depth, PINHOLE, None, sigma_m, covariance)
         _, exact = checked_evidence(depth, PINHOLE, None, sigma_m)
-        table = own.noise_model(NOISE, depth).table(PINHOLE)
-        of_sensor, bias = exact.noise_model(NOISE, depth).table(PINHOLE).at_pixels(depth)
+        table = own.noise_model(noise, depth).table(PINHOLE)
+        of_sensor, bias = exact.noise_model(noise, depth).table(PINHOLE).at_pixels(depth)
         found, same_bias = table.at_pixels(depth)
         np.testing.assert_allclose(found, np.hypot(of_sensor, of_pose), rtol=1e-5)
         np.testing.assert_array_equal(bias, same_bias)
         assert (table.largest(depth.ravel())[0] >= found.ravel() * (1 - 1e-6)).all()
         assert own.content() != exact.content()
-
-
-class NoPolynomials:
-    def table(self, camera: object) -> object:
-        return object()
 
 
 def test_what_is_no_covariance_is_refused() -> None:
@@ -166,6 +169,3 @@ def test_what_is_no_covariance_is_refused() -> None:
     ):
         with pytest.raises(KeyframeError, match=why):
             checked_evidence(np.ones(PINHOLE.shape, np.float32), PINHOLE, None, None, wrong)
-    own = OwnEvidence(NoPolynomials(), pose_covariance=good)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="pose_covariance needs polynomial noise"):
-        own.noise_model(NOISE, np.ones(PINHOLE.shape)).table(PINHOLE)

@@ -101,7 +101,7 @@ def test_a_late_joiner_sees_the_whole_map(page: LivePage, saved: MRFMap) -> None
     seen = page.look()
     assert seen.voxels == seen.said == voxels_of(saved, 0.5) > 1000
     assert len(seen.keyframes) == len(saved.keyframes)
-    assert {"/way", "/camera"} <= set(seen.nodes)
+    assert {"/path", "/camera"} <= set(seen.nodes)
 
 
 def test_the_first_view_has_all_keyframes_in_it(page: LivePage) -> None:
@@ -231,7 +231,7 @@ def test_each_layer_goes_and_comes_by_itself(page: LivePage) -> None:
     before = page.look()
     for label, gone in (
         ("Map", lambda name: name.startswith("/voxels")),
-        ("Path", lambda name: name in ("/way", "/camera")),
+        ("Path", lambda name: name in ("/path", "/camera")),
         ("Keyframes", lambda name: name.startswith("/keyframes")),
     ):
         page.tick(label, on=False)

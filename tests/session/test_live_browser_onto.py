@@ -32,9 +32,9 @@ FRUSTA = """() => {
 }"""
 """Colour of the frustum of each keyframe, by its number."""
 
-WAY = """() => {
+PATH = """() => {
   let lines = -1;
-  window.__viserMutable.nodeRefFromName['/way'].traverse(object => {
+  window.__viserMutable.nodeRefFromName['/path'].traverse(object => {
     if (object.isLineSegments2) lines = object.geometry.attributes.instanceStart.count;
   });
   return lines;
@@ -69,7 +69,7 @@ def test_the_page_says_how_surely_it_is_located_and_shows_the_days_apart(
         assert table["located"].split(" cm, ")[0].isdigit()
         assert any(line.endswith(table["located"] + ".") for line in program.said)
         colors = page.page.evaluate(FRUSTA)
-        assert page.page.evaluate(WAY) == YESTERDAY + TODAY - 2
+        assert page.page.evaluate(PATH) == YESTERDAY + TODAY - 2
         assert page.problems == []
     hues = [[colors[str(i)] >> shift & 255 for shift in (16, 8, 0)] for i in range(YESTERDAY + TODAY)]
     earlier, today = hues[:YESTERDAY], hues[YESTERDAY:]

@@ -335,7 +335,7 @@ BETWEEN = 4
 
 @cache
 def carried() -> list[Frame]:
-    """The way of ``frames``, as a camera that is carried along sees it, from the second of them on."""
+    """The path of ``frames``, as a camera that is carried along sees it, from the second of them on."""
     count = BETWEEN * COUNT
     dataset = open_dataset(f"synthetic:room?frames={count}&width=160&height=120", color=False)
     return [dataset.read(index) for index in range(BETWEEN, count // 2)]
@@ -358,11 +358,11 @@ def live(days: Days, placed: Placed, out: Path) -> tuple[Session, FakeLink]:
 def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days, tmp_path: Path) -> None:
     said: list[str] = []
     still = [replace(carried()[0], stamp=-1.0 - i) for i in range(30, 0, -1)]
-    way = [*still, *carried()]
-    running = camera(way)
+    path = [*still, *carried()]
+    running = camera(path)
     placed = placed_in(load_map(days.map), "yesterday", running, said.append)
     located_by = running.came
-    assert len(still) < located_by < len(way)
+    assert len(still) < located_by < len(path)
     assert said[:-1] == [f"move the camera: {n} of 10 views seen" for n in range(11)]
     assert said[-1].startswith("hold the camera still")
     assert len(placed.kept) < located_by - len(still) + 2  # while it stands, one is enough
@@ -371,8 +371,8 @@ def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days
     track = session.state.result().track
     assert track is not None
     assert track.lost == 0
-    assert len(track.frames) == len(placed.kept) + len(way) - located_by
-    truth = {round(frame.stamp, 6): frame.T_world_camera for frame in way}
+    assert len(track.frames) == len(placed.kept) + len(path) - located_by
+    truth = {round(frame.stamp, 6): frame.T_world_camera for frame in path}
     for stamp, T in track.trajectory(m):
         off = np.linalg.inv(truth[round(stamp - placed.later_s, 6)]) @ T
         assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
@@ -381,9 +381,9 @@ def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days
     assert_shown_is(session, link)
     # After a reset the camera begins where it began, although its next image is from where it went.
     kept = len(placed.kept)
-    running.frames = [*way, way[-1]]
+    running.frames = [*path, path[-1]]
     link.ask(Reset())
-    session.run(lambda: running.came == len(way) + 1)
+    session.run(lambda: running.came == len(path) + 1)
     again = session.state.result().track
     assert again is not None
     assert set(range(kept)) <= set(again.frames)
@@ -395,14 +395,15 @@ def test_a_camera_without_poses_is_followed_from_where_it_was_located(days: Days
 def test_a_camera_that_is_lost_while_it_is_located_begins_again(days: Days) -> None:
     said: list[str] = []
     elsewhere = frames("synthetic:corridor")[:1] * 12
-    way = [*carried()[:12], *elsewhere, *carried()]
-    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(way)])
+    path = [*carried()[:12], *elsewhere, *carried()]
+    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(path)])
     placed = placed_in(load_map(days.map), "yesterday", running, said.append)
     lost = next(i for i, text in enumerate(said) if "begins again" in text)
     assert said[lost + 1] == "move the camera: 0 of 10 views seen"
     first = placed.read(0)
     assert first.stamp - placed.later_s >= 0.1 * 12
-    off = np.linalg.inv(way[round(10 * (first.stamp - placed.later_s))].T_world_camera) @ first.T_world_camera
+    there = path[round(10 * (first.stamp - placed.later_s))]
+    off = np.linalg.inv(there.T_world_camera) @ first.T_world_camera
     assert np.linalg.norm(off[:3, 3]) < CONFIG.voxel_size
 
 
@@ -421,8 +422,8 @@ def test_a_camera_that_ends_before_it_has_seen_enough_is_not_located(days: Days)
 
 
 def test_a_camera_that_is_moved_to_and_fro_keeps_few_frames(days: Days) -> None:
-    way = [*(carried()[:2] * 90), *carried()[2:]]
-    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(way)])
+    path = [*(carried()[:2] * 90), *carried()[2:]]
+    running = camera([replace(frame, stamp=0.1 * i) for i, frame in enumerate(path)])
     placed = placed_in(load_map(days.map), "yesterday", running)
     assert running.came > 180
     assert 10 <= len(placed.kept) <= MOST_KEPT

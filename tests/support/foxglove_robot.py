@@ -100,6 +100,10 @@ class Robot:
             if not topics or topic in topics:
                 self.channels[topic].log(data, log_time=time)
 
+    def send_again(self, topic: str) -> None:
+        """Send the first message of a topic as one of this moment."""
+        self.channels[topic].log(next(data for name, _, data in self.messages if name == topic))
+
     def send_next(self, count: int) -> None:
         """Send the next messages in the order of recording, as many as there are."""
         for topic, time, data in self.messages[self.sent : self.sent + count]:

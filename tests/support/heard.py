@@ -1,5 +1,6 @@
 """What a client of a robot's wire hears, and what a recording made of it shows: frames that are the bag's."""
 
+import time
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -83,10 +84,12 @@ def heard_by(live: stream.Robot) -> int:
     return sum(topic.messages for topic in live.heard.topics.values())
 
 
-def one_by_one(sender: Any, live: Dataset) -> list[Frame]:
-    """The frames of what the robot sends, when each message is heard before the next is sent."""
+def one_by_one(sender: Any, live: Dataset, pause_s: float = 0.0) -> list[Frame]:
+    """The frames of what the robot sends, when each message is heard, and a pause made, before the next is
+    sent."""
     found, heard = [], heard_by(whole(live))
     while sender.sent < len(sender.messages):
+        time.sleep(pause_s)
         heard += sender.messages[sender.sent][0] in sender.listener.topics
         sender.send_next(1)
         assert wait_until(partial(has_heard, live, heard), SECONDS)

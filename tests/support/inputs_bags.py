@@ -330,7 +330,7 @@ def odometry(
     late: float = 0.0,
     numbers: Sequence[float] = range(COUNT),
 ) -> None:
-    """The way of a body that starts at T, as Odometry."""
+    """The path of a body that starts at T, as Odometry."""
     for i in numbers:
         bag.odometry(topic, stamp(i) + late, "odom", child, T @ world_body(i))
 
@@ -344,13 +344,13 @@ def moving_tf(
     late: float = 0.0,
     numbers: Sequence[float] = range(COUNT),
 ) -> None:
-    """The way of a body that starts at T, as transforms."""
+    """The path of a body that starts at T, as transforms."""
     for i in numbers:
         bag.tf(topic, stamp(i) + late, parent, child, T @ world_body(i))
 
 
 def stamped_poses(bag: Bag, topic: str, frame: str = "map", T_body_own: Pose = EYE) -> None:
-    """The way of something on the body, as PoseStamped, which names no body."""
+    """The path of something on the body, as PoseStamped, which names no body."""
     for i in range(COUNT):
         bag.pose_stamped(topic, stamp(i), frame, world_body(i) @ T_body_own)
 

@@ -36,7 +36,7 @@ def lidar(rows: int, columns: int) -> SphericalCamera:
 
 
 def level_pose(phase: float) -> Pose:
-    """T_world_lidar at a phase of the way through the room: level, x forward."""
+    """T_world_lidar at a phase of the path through the room: level, x forward."""
     T_world_camera, T = camera_pose(phase), np.eye(4)
     x, y, _ = T_world_camera[:3, 2] / np.hypot(*T_world_camera[:2, 2])
     T[:3, :3] = [[x, -y, 0], [y, x, 0], [0, 0, 1]]
@@ -77,7 +77,7 @@ class MovingScan:
 
 
 def scan(number: int, of: int, still: SphericalCamera, moved_m: float = MOVED_M) -> MovingScan:
-    """One of several scans along the way. Taichi has to run."""
+    """One of several scans along the path. Taichi has to run."""
     T = level_pose((number + 0.2) / of)
     moving = RayTable.moving(still, motion(still.width, moved_m))
     true_m = ray_depths(room_scene(), moving, T)
@@ -96,7 +96,7 @@ class Score:
 
 
 def score(m: MRFMap, views: int) -> Score:
-    """Judge a map by level views from the way, to four sides."""
+    """Judge a map by level views from the path, to four sides."""
     right, errors = [], []
     for view in range(views):
         eye = camera_pose((view + 0.7) / views)[:3, 3]

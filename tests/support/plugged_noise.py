@@ -1,4 +1,4 @@
-"""A sigma for each pixel, and another law of measurements, as plugs from outside."""
+"""A sigma for each pixel, one of squared depth, and another law of measurements, as plugs from outside."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -82,6 +82,79 @@ class PixelNoise(StoredNoise):
     @classmethod
     def of_arrays(cls, file: Arrays) -> "PixelNoise":
         return cls(file.array("sigma_m", "f", (None, None)))
+
+
+@ti.dataclass
+class _SquareSigma(Struct):
+    """The noise of all pixels of a stereo camera."""
+
+    least: F32
+    growth: F32
+    offset: F32
+
+    @ti.func
+    def sigma(self, depth: F32):
+        return self.least + self.growth * depth * depth
+
+    @ti.func
+    def bias(self, depth: F32):
+        return self.offset
+
+    @ti.func
+    def sigma_slope(self, depth: F32):
+        return 2.0 * self.growth * depth
+
+    @ti.func
+    def bias_slope(self, depth: F32):
+        return 0.0
+
+
+@dataclass(frozen=True)
+class SquareSigmas(SensorNoise):
+    """One law for all pixels."""
+
+    least: F32
+    growth: F32
+    offset: F32
+
+    @ti.func
+    def at_pixel(self, u: I32, v: I32):
+        return _SquareSigma(self.least, self.growth, self.offset)
+
+
+@dataclass(frozen=True)
+class SquareNoise(StoredNoise):
+    """sigma = least_m + growth * depth^2 and a bias of offset_m, as PolynomialNoise((least_m, 0, growth),
+    (offset_m,)) has them, by a class that holds no polynomials."""
+
+    least_m: float
+    growth: float
+    offset_m: float = 0.0
+
+    def table(self, camera: Any) -> "SquareNoise":
+        return self
+
+    def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        depth = depth_m.astype(np.float64)
+        return self.least_m + self.growth * depth * depth, np.full(depth.shape, self.offset_m)
+
+    def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        sigma, bias = self.at_pixels(depth_m)
+        return sigma, np.abs(bias)
+
+    def sensor(self, camera: Any) -> Sensor:
+        return Sensor(camera.in_kernels(), SquareSigmas(self.least_m, self.growth, self.offset_m))
+
+    def curves(self, depth_m: NDArray[np.float64]) -> Curves:
+        sigma, bias = self.at_pixels(depth_m)
+        return sigma[None], bias[None]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"square": np.array([self.least_m, self.growth, self.offset_m])}
+
+    @classmethod
+    def of_arrays(cls, file: Arrays) -> "SquareNoise":
+        return cls(*file.array("square", "f", (3,)).tolist())
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ def bricks(roster: ShownKeyframes) -> set[tuple[int, ...]]:
 
 def places(roster: ShownKeyframes) -> np.ndarray:
     """Where along x the camera's path leads, from line to line."""
-    lines = roster.way()[0][:, :, 0]
+    lines = roster.path()[0][:, :, 0]
     np.testing.assert_array_equal(lines[1:, 0], lines[:-1, 1])
     return np.append(lines[:1, 0], lines[:, 1])
 
@@ -52,12 +52,12 @@ def test_a_long_way_keeps_its_ends_and_its_order() -> None:
     count = 3 * MOST_WAYPOINTS
     for id in range(count):
         roster.put(keyframe(id, "frozen"))
-    way = places(roster)
-    assert len(way) <= MOST_WAYPOINTS + MOST_FROZEN
-    assert way[0] == 0
-    assert way[-1] == count - 1
-    assert np.all(np.diff(way) > 0)
-    assert np.diff(way).max() <= 4
+    path = places(roster)
+    assert len(path) <= MOST_WAYPOINTS + MOST_FROZEN
+    assert path[0] == 0
+    assert path[-1] == count - 1
+    assert np.all(np.diff(path) > 0)
+    assert np.diff(path).max() <= 4
 
 
 def test_a_keyframe_that_is_off_has_seen_nothing() -> None:
@@ -71,5 +71,5 @@ def test_no_line_leads_from_an_earlier_day_to_today() -> None:
     roster = ShownKeyframes()
     for id in range(3 * MOST_FROZEN):
         roster.put(replace(keyframe(id, "frozen"), earlier=id < 7))
-    steps = roster.way()[0][:, :, 0].tolist()
+    steps = roster.path()[0][:, :, 0].tolist()
     assert steps == [[id, id + 1] for id in range(3 * MOST_FROZEN - 1) if id != 6]

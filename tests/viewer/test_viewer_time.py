@@ -163,10 +163,10 @@ def test_scrubbing_shows_how_far_the_camera_had_come_and_what_it_saw(running: Ti
 
     def steps() -> NDArray[np.uint8]:
         """The colours of the two steps of the camera's path."""
-        way = running.server.scene.get_handle_by_name("/way")
-        assert isinstance(way, viser.LineSegmentsHandle)
-        assert (way.colors[:, 0] == way.colors[:, 1]).all()
-        return way.colors[:, 0]
+        path = running.server.scene.get_handle_by_name("/path")
+        assert isinstance(path, viser.LineSegmentsHandle)
+        assert (path.colors[:, 0] == path.colors[:, 1]).all()
+        return path.colors[:, 0]
 
     assert (steps()[0] == steps()[1]).all()
     past = steps()[0]

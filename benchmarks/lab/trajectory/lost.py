@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.lab.trajectory.following import map_figures
-from benchmarks.lab.trajectory.walks import HOLD_OUT, Walk, Way, ring_walk, room_walk, small_camera
+from benchmarks.lab.trajectory.walks import HOLD_OUT, CameraPath, Walk, ring_walk, room_walk, small_camera
 from taichi_mrf.config.schema import Config
 from taichi_mrf.evaluation.tables import Entry
 from taichi_mrf.experiments.folds import Experiment
@@ -38,12 +38,12 @@ SAME, SEEN, UNSEEN = (
     "carried to a place seen before",
     "carried to a place never seen",
 )
-PLACES: dict[str, tuple[Callable[[Path], Way], float]] = {
+PLACES: dict[str, tuple[Callable[[Path], CameraPath], float]] = {
     SAME: (room_walk, BEFORE / RATE),
     SEEN: (room_walk, 3.0 + BETWEEN_S),
     UNSEEN: (lambda data: ring_walk(False, data), 20.0),
 }
-"""Case -> the way on which the camera goes on, and the seconds from its beginning."""
+"""Case -> the path on which the camera goes on, and the seconds from its beginning."""
 
 COLUMNS = [
     "camera", "voxels", "poses by", "found covered", "map kept", "found after", "of these wrong",
@@ -62,8 +62,8 @@ NOTES = (
 def lost_result(experiment: Experiment, case: str, config: Config) -> Result:
     """Result for a camera in one of PLACES."""
     seed = experiment.seeds[0]
-    way, (other, start_s) = room_walk(experiment.data), PLACES[case]
-    shots = [way.frame(i / RATE, f"room-{i:04d}", (seed, i)) for i in range(BEFORE)]
+    path, (other, start_s) = room_walk(experiment.data), PLACES[case]
+    shots = [path.frame(i / RATE, f"room-{i:04d}", (seed, i)) for i in range(BEFORE)]
     clean = {i: clean_m for i, (_, clean_m) in enumerate(shots) if is_held_out(i + 1, HOLD_OUT)}
     walk = Walk("room", small_camera(), frames=[frame for frame, _ in shots], clean_m=clean)
     last = walk.frames[-1]

@@ -20,11 +20,11 @@ from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.corridor import (
     LAMP_OVER_EYE_M,
-    SmoothWay,
+    SmoothPath,
     corridor_scene,
-    pose_on_way,
+    pose_on_path,
+    ring_path,
     ring_scene,
-    ring_way,
     waypoints,
 )
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
@@ -59,12 +59,12 @@ ROOM_SECONDS = 10.0
 RING_M = 60.0
 OFFICE_ROOMS = 2
 
-HOUSE_WAY = (
+HOUSE_PATH = (
     (3.0, -3.8), (5.4, -3.0), (5.8, -1.2), (4.6, 0.8), (1.6, 1.9), (-1.0, 1.9), (-1.6, 0.0), (-3.0, -0.4),
     (-4.6, 0.3), (-7.6, 0.1), (-8.7, -1.6), (-7.4, -3.2), (-4.8, -3.3), (-3.2, -2.2), (-1.7, -2.2),
     (-1.6, -3.9), (0.5, -3.9), (3.0, -3.8), (4.5, -3.4),
 )  # fmt: skip
-"""Corners of a way through all rooms of the house, in metres; it ends where it began, a little further on."""
+"""Corners of a path through all rooms of the house, in metres; it ends a little beyond its beginning."""
 
 SHAKE_M, SHAKE_RAD = 0.02, math.radians(1.5)
 """Amplitudes along and about each axis by which the hand that carries a camera shakes it, and at which
@@ -96,8 +96,8 @@ class Walk(Dataset):
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way through a simulated scene: how a picture is taken there (axial depth, and RGB if asked for), and
+class CameraPath:
+    """A path through a simulated scene: how a picture is taken there (axial depth, and RGB if asked for), and
     where the camera is after so many seconds."""
 
     picture: Callable[[Pose, bool], tuple[NDArray[np.float32], NDArray[np.uint8] | None]]
@@ -142,8 +142,8 @@ def sources() -> list[Source]:
         BARE_COLOR: (partial(ring_walk, True), True),
     }
     taken = [
-        Source(name, RATES, lambda e, rate, n=name, w=way, c=color: simulated_walk(e, n, w(e.data), rate, c))  # type: ignore[misc]
-        for name, (way, color) in simulated.items()
+        Source(name, RATES, lambda e, rate, n=name, w=path, c=color: simulated_walk(e, n, w(e.data), rate, c))  # type: ignore[misc]
+        for name, (path, color) in simulated.items()
     ]
     recorded = [
         Source(name, (3.0,), lambda e, rate, c=color: kitchen_walk(e, rate, c))  # type: ignore[misc]
@@ -152,11 +152,11 @@ def sources() -> list[Source]:
     return [*recorded, *taken]
 
 
-def simulated_walk(experiment: Experiment, name: str, way: Way, rate: float, color: bool) -> Walk:
-    """The frames of a way at ``rate`` images a second, with a Kinect 1's noise."""
+def simulated_walk(experiment: Experiment, name: str, path: CameraPath, rate: float, color: bool) -> Walk:
+    """The frames of a path at ``rate`` images a second, with a Kinect 1's noise."""
     frames, clean = [], {}
-    for index in range(round(way.seconds * rate))[: experiment.limit]:
-        frame, true_m = way.frame(index / rate, f"{name}-{index:04d}", (experiment.seeds[0], index), color)
+    for index in range(round(path.seconds * rate))[: experiment.limit]:
+        frame, true_m = path.frame(index / rate, f"{name}-{index:04d}", (experiment.seeds[0], index), color)
         frames.append(frame)
         if is_held_out(index + 1, HOLD_OUT):
             clean[index] = true_m
@@ -178,37 +178,37 @@ def small_camera() -> PinholeCamera:
     return RenderOptions(width=WIDTH, height=HEIGHT).camera()
 
 
-def room_walk(data: Path) -> Way:
+def room_walk(data: Path) -> CameraPath:
     """Once around the built-in room."""
     return _rendered(
         room_scene(), lambda seconds: camera_pose(seconds / ROOM_SECONDS), ROOM_SECONDS, carried_lamp=False
     )
 
 
-def ring_walk(bare: bool, data: Path) -> Way:
+def ring_walk(bare: bool, data: Path) -> CameraPath:
     """Once around the ring corridor."""
-    way = ring_way(RING_M)
+    path = ring_path(RING_M)
     return _rendered(
-        ring_scene(RING_M, bare), lambda seconds: way.pose_at(seconds * SPEED), way.length_m / SPEED
+        ring_scene(RING_M, bare), lambda seconds: path.pose_at(seconds * SPEED), path.length_m / SPEED
     )
 
 
-def _office(data: Path) -> Way:
+def _office(data: Path) -> CameraPath:
     """Into two rooms off a corridor and out again, with the camera in a hand."""
-    way = waypoints(OFFICE_ROOMS)
-    seconds = float(np.linalg.norm(np.diff(way[:, :3], axis=0), axis=1).sum()) / OFFICE_SPEED
+    path = waypoints(OFFICE_ROOMS)
+    seconds = float(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).sum()) / OFFICE_SPEED
     return _rendered(
-        corridor_scene(OFFICE_ROOMS), lambda t: shaken(pose_on_way(way, t / seconds), t), seconds
+        corridor_scene(OFFICE_ROOMS), lambda t: shaken(pose_on_path(path, t / seconds), t), seconds
     )
 
 
-def _house(data: Path) -> Way:
+def _house(data: Path) -> CameraPath:
     scene = MeshScene(load_mesh(data / "meshes" / "house.ply"))
-    way, camera = SmoothWay(HOUSE_WAY), small_camera()
-    return Way(
+    path, camera = SmoothPath(HOUSE_PATH), small_camera()
+    return CameraPath(
         lambda T, color: (scene.render_depth(camera, T), None),
-        lambda seconds: way.pose_at(seconds * SPEED),
-        way.length_m / SPEED,
+        lambda seconds: path.pose_at(seconds * SPEED),
+        path.length_m / SPEED,
     )
 
 
@@ -220,8 +220,8 @@ def shaken(T_world_camera: Pose, seconds: float) -> Pose:
 
 def _rendered(
     scene: Scene, pose_at: Callable[[float], Pose], seconds: float, carried_lamp: bool = True
-) -> Way:
-    """A way through an analytic scene. Its lamp, or one over the camera, lights the colour images, in which
+) -> CameraPath:
+    """A path through an analytic scene. Its lamp, or one over the camera, lights the colour images, in which
     everything is mottled."""
     camera = small_camera()
 
@@ -231,4 +231,4 @@ def _rendered(
         depth_m, rgb = render(lit, camera, T, color)
         return depth_m, None if rgb is None else mottled(rgb, depth_m, camera, T)
 
-    return Way(picture, pose_at, seconds)
+    return CameraPath(picture, pose_at, seconds)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.cluster.submaps.plan import Plan
-from taichi_mrf.evaluation.pictures.figures import draw_way, new_figure
+from taichi_mrf.evaluation.pictures.figures import draw_camera_path, new_figure
 from taichi_mrf.export.map_server import grey_image
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.queries.points import probability
@@ -57,7 +57,7 @@ def write_submap_picture(
         # Within the picture also where only a corner of the column is.
         left, bottom = np.maximum((x, y), low) + 0.03 * across
         axes.text(left, bottom, str(len(submap.keyframes)), color=BLUE, fontsize=9, clip_on=True)
-    draw_way(axes, eyes[:, :2])
+    draw_camera_path(axes, eyes[:, :2])
     title = f"{len(plan.submaps)} submaps with the number of their keyframes, of {len(eyes)}"
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)", title=title)
     with atomic_path(path) as temporary:

@@ -3,7 +3,7 @@
 Options follow a question mark, ``synthetic:floor-plan?scans=200&beams=181&noise=0.02&seed=1``; the fields of
 :class:`FloorPlanOptions` are the options.
 
-The building has rooms, doors, pillars, and a way through all of it; everything lies in the plane. It is
+The building has rooms, doors, pillars, and a path through all of it; everything lies in the plane. It is
 centred on the world's origin, 14 m wide and 10 m deep: a corridor along x, three rooms to the north of it and
 two to the south.
 """
@@ -109,8 +109,8 @@ def building() -> Building:
     return Building(np.array(boxes + furniture), np.array(pillars))
 
 
-def way() -> NDArray[np.float64]:
-    """Corners, (P, 2), of the robot's way: through every door and around what stands in each room."""
+def robot_path() -> NDArray[np.float64]:
+    """Corners, (P, 2), of the robot's path: through every door and around what stands in each room."""
     points = [(-6.2, 0.0)]
     for x, side, inner, outer, width in (
         (-4.6, 1, 2.0, 4.1, 1.2),
@@ -148,7 +148,7 @@ class FloorPlanOptions:
     """The options of the built-in scans."""
 
     scans: int = 200
-    """Scans, evenly spread along the robot's way."""
+    """Scans, evenly spread along the robot's path."""
 
     beams: int = 181
     """Beams of a scan, evenly spread over the field of view with both its ends."""
@@ -185,7 +185,7 @@ def open_floor_plan(source: str) -> LaserScans:
 def simulate_scans(options: FloorPlanOptions) -> LaserScans:
     """Drive through the building and cast every beam. The same options give the same scans."""
     walls = building()
-    pose = poses_along(way(), options.scans)
+    pose = poses_along(robot_path(), options.scans)
     half = math.radians(options.field_of_view) / 2
     angle = np.linspace(-half, half, options.beams) if options.beams > 1 else np.zeros(1)
     shape = (options.scans, options.beams)
@@ -203,7 +203,7 @@ def simulate_scans(options: FloorPlanOptions) -> LaserScans:
 
 def poses_along(corners: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Poses (count, 3), x y theta, evenly spread by length from the first corner (P, 2) to the last, each
-    looking along its leg of the way."""
+    looking along its leg of the path."""
     legs = np.array([b - a for a, b in pairwise(corners)])
     lengths = np.hypot(*legs.T)
     ends = np.cumsum(lengths)

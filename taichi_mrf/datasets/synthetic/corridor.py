@@ -182,7 +182,7 @@ def _room_waypoints(room: Room) -> list[Waypoint]:
     inside = (*room.to_plan(2.05, -1.95), EYE)
     corridor = (*room.to_plan(DOOR_X, front - HALF_WIDTH), EYE)
     begin = -0.6
-    way: list[Waypoint] = [
+    path: list[Waypoint] = [
         (*corridor, room.heading(math.pi / 2), -0.1),
         (*door, room.heading(0.55 * math.pi), -0.15),
         (*inside, room.heading(0.65 * math.pi), -0.2),
@@ -190,50 +190,50 @@ def _room_waypoints(room: Room) -> list[Waypoint]:
     for a in np.linspace(begin, begin + 2 * math.pi, 25).tolist():
         place = room.to_plan(1.45 * math.cos(a) - 0.1, 1.0 * math.sin(a) - 0.35)
         heading = a + math.pi + 0.35 * math.sin(2 * a)
-        way.append(
+        path.append(
             (*place, EYE + 0.12 * math.sin(2 * a), room.heading(heading), -0.24 + 0.2 * math.sin(3 * a))
         )
-    way += [
+    path += [
         (*inside, room.heading(1.1 * math.pi), -0.2),
         (*door, room.heading(1.5 * math.pi), -0.1),
         (*corridor, room.heading(1.5 * math.pi), -0.1),
     ]
-    return way
+    return path
 
 
 def waypoints(rooms: int) -> NDArray[np.float64]:
-    """(n, 5): the way from the west end into each room, as its doorway comes, to the east end."""
+    """(n, 5): the path from the west end into each room, as its doorway comes, to the east end."""
     numbers = sorted(range(rooms), key=lambda number: Room(number).to_plan(DOOR_X, 0.0)[0])
     length = corridor_length(rooms)
-    way: list[Waypoint] = [(0.6, 0.0, EYE, 0.0, -0.1)]
+    path: list[Waypoint] = [(0.6, 0.0, EYE, 0.0, -0.1)]
     for number in numbers:
         into = _room_waypoints(Room(number))
         # Along the corridor the camera looks where it goes; at the door it turns.
-        way += [(into[0][0] - 0.5, 0.0, EYE, 0.0, -0.1), *into, (into[-1][0] + 0.5, 0.0, EYE, 0.0, -0.1)]
-    way += [(length - 0.6, 0.0, EYE, 0.0, -0.1), (length - 0.6, 0.0, EYE, math.pi, -0.1)]
-    table = np.array(way)
+        path += [(into[0][0] - 0.5, 0.0, EYE, 0.0, -0.1), *into, (into[-1][0] + 0.5, 0.0, EYE, 0.0, -0.1)]
+    path += [(length - 0.6, 0.0, EYE, 0.0, -0.1), (length - 0.6, 0.0, EYE, math.pi, -0.1)]
+    table = np.array(path)
     table[:, 3] = np.unwrap(table[:, 3])
     return table
 
 
-def pose_on_way(way: NDArray[np.float64], phase: float) -> Pose:
-    """T_world_camera at ``phase`` of a way (n, 5), 0 to 1: at even speed, turning included."""
-    steps = np.linalg.norm(np.diff(way[:, :3], axis=0), axis=1)
-    steps += METRES_PER_RADIAN * np.abs(np.diff(way[:, 3]))
+def pose_on_path(path: NDArray[np.float64], phase: float) -> Pose:
+    """T_world_camera at ``phase`` of a path (n, 5), 0 to 1: at even speed, turning included."""
+    steps = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1)
+    steps += METRES_PER_RADIAN * np.abs(np.diff(path[:, 3]))
     reached = np.concatenate([[0.0], np.cumsum(steps)])
-    x, y, z, heading, pitch = (np.interp(phase * reached[-1], reached, way[:, i]) for i in range(5))
+    x, y, z, heading, pitch = (np.interp(phase * reached[-1], reached, path[:, i]) for i in range(5))
     eye = np.array([x, y, z]) + CORRIDOR_IN_WORLD
     return look_at(eye, eye + np.array([math.cos(heading), math.sin(heading), math.tan(pitch)]))
 
 
 STEP_M = 0.02
-"""Between neighbouring points of the way."""
+"""Between neighbouring points of the path."""
 
 EYE_M = 1.5
 
 
-class SmoothWay:
-    """The way past some corners, (n, 2) in metres, over a floor at ``floor_z``."""
+class SmoothPath:
+    """The path past some corners, (n, 2) in metres, over a floor at ``floor_z``."""
 
     def __init__(
         self, corners: Sequence[tuple[float, float]], rounding_m: float = 3.0, floor_z: float = 0.0
@@ -298,12 +298,12 @@ def ring_scene(length_m: float, bare: bool = False) -> Scene:
     return Scene(translated(solids, RING_IN_WORLD), light=RING_IN_WORLD)
 
 
-def ring_way(length_m: float) -> SmoothWay:
+def ring_path(length_m: float) -> SmoothPath:
     """Once around, counter-clockwise from the middle of the south side, and OVERLAP_M further."""
     a, b = _half_sizes(length_m)
     corners = [(0.0, -b), (a, -b), (a, b), (-a, b), (-a, -b), (OVERLAP_M, -b)]
     x, y, z = RING_IN_WORLD
-    return SmoothWay([(x + u, y + v) for u, v in corners], floor_z=z)
+    return SmoothPath([(x + u, y + v) for u, v in corners], floor_z=z)
 
 
 def _half_sizes(length_m: float) -> tuple[float, float]:
@@ -402,7 +402,7 @@ class CorridorOptions(RenderOptions):
     """The options of the built-in corridor."""
 
     frames: int = 600
-    """Views, evenly spread over the camera's way; 540 are left for the map when one in ten is kept out."""
+    """Views, evenly spread over the camera's path; 540 are left for the map when one in ten is kept out."""
 
     rooms: int = 12
     """Rooms off the corridor, which is 6.15 m long for every two."""
@@ -424,12 +424,12 @@ class SyntheticCorridor(Walked):
         return corridor_scene(self.options.rooms)
 
     @cached_property
-    def _way(self) -> NDArray[np.float64]:
+    def _camera_path(self) -> NDArray[np.float64]:
         return waypoints(self.options.rooms)
 
     def pose_at(self, index: int) -> Pose:
         """T_world_camera of a frame, (4, 4)."""
-        return pose_on_way(self._way, index / max(1, self.options.frames - 1))
+        return pose_on_path(self._camera_path, index / max(1, self.options.frames - 1))
 
 
 @dataclass(frozen=True)
@@ -437,7 +437,7 @@ class RingOptions(RenderOptions):
     """The options of the built-in ring corridor."""
 
     frames: int = 600
-    """Views, evenly spread over the camera's way."""
+    """Views, evenly spread over the camera's path."""
 
     length: float = 60.0
     """Metres once around, along the middle of the corridor."""
@@ -462,13 +462,13 @@ class SyntheticRing(Walked):
         return ring_scene(self.options.length, bare=self.options.walls == "bare")
 
     @cached_property
-    def way(self) -> SmoothWay:
-        """Way of the camera in the world frame."""
-        return ring_way(self.options.length)
+    def camera_path(self) -> SmoothPath:
+        """Path of the camera in the world frame."""
+        return ring_path(self.options.length)
 
     def pose_at(self, index: int) -> Pose:
         """T_world_camera of a frame, (4, 4)."""
-        return self.way.pose_at(self.way.length_m * index / max(1, self.options.frames - 1))
+        return self.camera_path.pose_at(self.camera_path.length_m * index / max(1, self.options.frames - 1))
 
 
 NAME = "synthetic:corridor"

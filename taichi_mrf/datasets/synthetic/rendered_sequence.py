@@ -83,7 +83,7 @@ class RenderOptions:
     """The options of every built-in scene."""
 
     frames: int = 32
-    """Views, evenly spread over the camera's way."""
+    """Views, evenly spread over the camera's path."""
 
     width: int = 320
     """Columns of the images; the field of view across is always that of a Kinect 1."""

@@ -139,7 +139,7 @@ class Sway:
 @dataclass(frozen=True)
 class MovingScene:
     """A scene of what never moves, and things that come, go and move. It repeats itself every ``period_s``
-    seconds; ``camera`` is the way of a camera that sees it happen."""
+    seconds; ``camera`` is the path of a camera that sees it happen."""
 
     static: Scene
     things: tuple[Thing, ...]
@@ -331,7 +331,7 @@ class RoomOptions(RenderOptions):
 
 @dataclass
 class SyntheticRoom(RenderedSequence):
-    """The synthetic room as a sequence of frames; the camera's way through it is closed."""
+    """The synthetic room as a sequence of frames; the camera's path through it is closed."""
 
     options: RoomOptions = RoomOptions()
 

@@ -50,7 +50,7 @@ def room_solids(doorway: Sequence[Solid] = ()) -> list[Solid]:
 
 
 def camera_pose(phase: float) -> Pose:
-    """T_world_camera at ``phase`` of the way, 0 to 1, a closed loop: around the middle of the room at eye
+    """T_world_camera at ``phase`` of the path, 0 to 1, a closed loop: around the middle of the room at eye
     height, looking across to the other side, up and down by turns."""
     a = 2 * math.pi * phase
     eye = np.array([1.45 * math.cos(a) - 0.1, 1.0 * math.sin(a) - 0.35, 1.5 + 0.12 * math.sin(2 * a)])

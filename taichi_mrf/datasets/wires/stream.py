@@ -33,7 +33,8 @@ from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.motion import MOST_SAMPLES, upwards_at
 
 LATE_S = 1.0
-"""Poses come at most so much later than the largest gap allows; an image that has none by then gets none."""
+"""Poses come at most so much later than the largest gap allows, by the robot's stamps and by this machine's
+clock; an image that has none by then gets none."""
 
 CLOCKS_S = 5.0
 """Stamps that are further from when they arrive are of another clock, not late."""
@@ -46,12 +47,13 @@ SILENCE_S = 10.0
 
 
 class Posed(NamedTuple):
-    """A message of the sensor: its number, what was heard, how much later than stamped it counts, as the
-    clock has started again, T_world_camera, (4, 4), None while it waits for that, and the images of other
-    topics that belong to it, by these."""
+    """A message of the sensor: its number, what was heard, up to when poses are needed for it, how much later
+    than stamped it counts, as the clock has started again, T_world_camera, (4, 4), None while it waits for
+    that, and the images of other topics that belong to it, by these."""
 
     number: int
     heard: Heard
+    until_s: float
     later_s: float
     pose: Pose | None = None
     beside: Mapping[str, Any] = {}
@@ -73,7 +75,7 @@ class Robot(Dataset):
         self._came = 0
         self._waiting: deque[Posed] = deque()
         self._next: Posed | None = None
-        self._newest_s = self._read_s = -math.inf
+        self._newest_s = self._newest_stamp = self._read_s = -math.inf
         self._latest: tuple[float, float] | None = None  # the sensor's last stamp, and when it arrived
         self._later_s = self._off_s = 0.0
         self._news: dict[str, str] = {}  # said once of each subject
@@ -169,6 +171,7 @@ class Robot(Dataset):
         """Take what has come: images wait for their poses."""
         for each in heard:
             self._newest_s = max(self._newest_s, each.arrived_s)
+            self._newest_stamp = max(self._newest_stamp, each.entry.stamp)
             if each.topic.name == self.sensor.topic:
                 self._take_image(each)
                 continue
@@ -185,7 +188,8 @@ class Robot(Dataset):
                 return
             self._waiting.popleft()
             entry = image.heard.entry
-            pose = self.poses[entry.frame].at(entry.stamp, self.gap) if entry.frame in self.poses else None
+            known = self.poses.get(entry.frame)
+            pose = None if known is None or image.until_s > known.until else known.at(entry.stamp, self.gap)
             if pose is None:
                 self.dropped += 1
                 continue
@@ -196,7 +200,8 @@ class Robot(Dataset):
         stamp = heard.entry.stamp
         self._begin_again(stamp, heard.arrived_s)
         self._latest = max(stamp, self._latest[0] if self._latest else stamp), heard.arrived_s
-        self._waiting.append(Posed(self._came, heard, self._later_s))
+        until_s = self.until(heard.entry, heard.message)
+        self._waiting.append(Posed(self._came, heard, until_s, self._later_s))
         self._came += 1
         if len(self._waiting) > MOST_IMAGES:
             self._waiting.popleft()
@@ -215,7 +220,7 @@ class Robot(Dataset):
         self.dropped += len(self._waiting) - len(kept)
         self._waiting = deque(kept)
         self._later_s += latest + max(0.0, arrived_s - at_s) - stamp
-        self._latest = stamp, arrived_s
+        self._latest, self._newest_stamp = (stamp, arrived_s), stamp
         self.jumps += 1
         by = _in_words(latest - stamp)
         self._news.setdefault(
@@ -227,10 +232,12 @@ class Robot(Dataset):
     def _whole(self, image: Posed) -> Posed | None:
         """An image with what belongs to it, once that and the poses around it have come, or will not come any
         more; None before."""
-        _, entry, message, arrived_s = image.heard
-        poses, (image, is_whole) = self.poses.get(entry.frame), self.complete(image)
-        is_whole = is_whole and (poses is None or self.until(entry, message) <= poses.until)
-        return image if is_whole or self._newest_s - arrived_s > self.gap + LATE_S else None
+        poses, (image, is_whole) = self.poses.get(image.heard.entry.frame), self.complete(image)
+        if is_whole and (poses is None or image.until_s <= poses.until):
+            return image
+        # While the robot or the connection pauses, its stamps do, too: what comes after that is not late.
+        late_s = min(self._newest_stamp - image.until_s, self._newest_s - image.heard.arrived_s)
+        return image if late_s > self.gap + LATE_S else None
 
 
 @dataclass

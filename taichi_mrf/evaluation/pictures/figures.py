@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_WAY_COLOR = "#e6007e"
+_PATH_COLOR = "#e6007e"
 """Magenta: on none of the colour scales."""
 
 _DPI = 120
@@ -55,14 +55,14 @@ def write_figure(figure: "Figure", path: Path) -> None:
         figure.canvas.print_png(temporary, pil_kwargs={"compress_level": 2})  # type: ignore[attr-defined]
 
 
-def draw_way(axes: "Axes", points: NDArray[np.floating]) -> None:
+def draw_camera_path(axes: "Axes", points: NDArray[np.floating]) -> None:
     """Draw the camera path through the keyframes, (N, 2) in the axes' units, and its legend."""
     if len(points) == 0:
         return
     axes.plot(*points.T, color="white", linewidth=3.0)
-    axes.plot(*points.T, color=_WAY_COLOR, linewidth=1.4, marker=".", markersize=3.0, label="camera path")
+    axes.plot(*points.T, color=_PATH_COLOR, linewidth=1.4, marker=".", markersize=3.0, label="camera path")
     axes.plot(
-        *points[0], "o", color=_WAY_COLOR, markeredgecolor="white", markersize=8.0, label="first keyframe"
+        *points[0], "o", color=_PATH_COLOR, markeredgecolor="white", markersize=8.0, label="first keyframe"
     )
     axes.figure.legend(loc="outside lower center", ncols=2, frameon=False)
 

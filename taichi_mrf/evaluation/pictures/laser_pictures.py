@@ -27,7 +27,7 @@ METHOD_NAMES = {
 """Full names of the methods."""
 
 _UNKNOWN_GREY = 0.8
-_WAY_COLOR = "#1f4fd8"
+_PATH_COLOR = "#1f4fd8"
 _PANELS_ACROSS = 4
 
 
@@ -90,22 +90,22 @@ def _energy_limits(traces: Mapping[str, Sequence[tuple[float, float]]]) -> tuple
     return lowest - margin, highest + margin
 
 
-def map_figure(laser_map: LaserMap, way_x_y: NDArray[np.float64], title: str) -> "Figure":
-    """One map: dark is occupied, grey is where no beam went; the robot's way (P, 2) is drawn over it."""
+def map_figure(laser_map: LaserMap, path_x_y: NDArray[np.float64], title: str) -> "Figure":
+    """One map: dark is occupied, grey is where no beam went; the robot's path (P, 2) is drawn over it."""
     x0, x1, y0, y1 = laser_map.extent
     width = 10.0
     figure = new_figure(width, float(np.clip(width * (y1 - y0) / max(x1 - x0, 1e-9), 3.0, 16.0)) + 0.8)
     axes = figure.add_subplot()
     _draw_map(axes, laser_map, title)
-    _draw_way(axes, way_x_y)
+    _draw_path(axes, path_x_y)
     axes.set(xlabel="x (m)", ylabel="y (m)")
     return figure
 
 
 def comparison_figure(
-    maps: Mapping[str, LaserMap], way_x_y: NDArray[np.float64], plan: FloorPlan | None
+    maps: Mapping[str, LaserMap], path_x_y: NDArray[np.float64], plan: FloorPlan | None
 ) -> "Figure":
-    """The maps side by side (Fig. 4), and before them the floor plan (if any) with the robot's way."""
+    """The maps side by side (Fig. 4), and before them the floor plan (if any) with the robot's path."""
     first = next(iter(maps.values()))
     x0, x1, y0, y1 = first.extent
     panels = len(maps) + 1
@@ -119,9 +119,9 @@ def comparison_figure(
         extent = (plan.lower_x_y[0], plan.upper_x_y[0], plan.lower_x_y[1], plan.upper_x_y[1])
         # Averaged on the way to the screen, or walls one pixel thick would be lost.
         truth.imshow(~plan.wall, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="antialiased")
-    _draw_way(truth, way_x_y)
+    _draw_path(truth, path_x_y)
     truth.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
-    truth.set_title("floor plan and way" if plan is not None else "way of the robot", fontsize=10)
+    truth.set_title("floor plan and path" if plan is not None else "path of the robot", fontsize=10)
     axes_of_maps = [figure.add_subplot(down, across, number + 2) for number in range(len(maps))]
     for axes, (method, laser_map) in zip(axes_of_maps, maps.items(), strict=True):
         _draw_map(axes, laser_map, method_name(method))
@@ -138,6 +138,6 @@ def _draw_map(axes: "Axes", laser_map: LaserMap, title: str) -> None:
     axes.set_aspect("equal")
 
 
-def _draw_way(axes: "Axes", way_x_y: NDArray[np.float64]) -> None:
-    axes.plot(*way_x_y.T, color=_WAY_COLOR, linewidth=1.0, alpha=0.7)
-    axes.plot(*way_x_y[0], "o", color=_WAY_COLOR, markersize=4.0)
+def _draw_path(axes: "Axes", path_x_y: NDArray[np.float64]) -> None:
+    axes.plot(*path_x_y.T, color=_PATH_COLOR, linewidth=1.0, alpha=0.7)
+    axes.plot(*path_x_y[0], "o", color=_PATH_COLOR, markersize=4.0)

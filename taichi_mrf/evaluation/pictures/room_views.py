@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
+from taichi_mrf.evaluation.pictures.figures import color_bar, draw_camera_path, new_figure
 from taichi_mrf.evaluation.pictures.raster import cast_triangles, cast_voxels, shaded, shaded_triangles
 from taichi_mrf.evaluation.pictures.surfaces import level_rotation
 from taichi_mrf.evaluation.pictures.viewpoint import (
@@ -111,17 +111,17 @@ class DrawnMap:
 
 
 def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
-    """The surface seen from above, or the voxels where there is none, coloured by height, with the way of the
-    camera.
+    """The surface seen from above, or the voxels where there is none, coloured by height, with the camera's
+    path.
 
     The axes are those of the world frame, turned by as little as makes them level.
     """
     R_level_world = level_rotation(room.up)
     level = (room.centres if surface is None else surface.vertices_m) @ R_level_world.T
-    way = np.array([R_level_world @ T[:3, 3] for T in room.T_world_cameras]).reshape(-1, 3)
+    eyes = np.array([R_level_world @ T[:3, 3] for T in room.T_world_cameras]).reshape(-1, 3)
     low, high = np.quantile(level, [0.01, 0.99], axis=0)  # without what a lidar saw through a door
-    if len(way):
-        low[:2], high[:2] = np.minimum(low, way.min(axis=0))[:2], np.maximum(high, way.max(axis=0))[:2]
+    if len(eyes):
+        low[:2], high[:2] = np.minimum(low, eyes.min(axis=0))[:2], np.maximum(high, eyes.max(axis=0))[:2]
     margin = 0.03 * (high - low)[:2].max() + room.voxel_size
     low[:2], high[:2] = low[:2] - margin, high[:2] + margin
     camera, pose = _camera_above(0.5 * (low + high), (high - low)[:2], R_level_world)
@@ -136,7 +136,7 @@ def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
     figure = new_figure(width_in + 1.6, height_in + 1.2)
     axes = figure.add_subplot()
     axes.imshow(picture, extent=(low[0], high[0], low[1], high[1]), interpolation="antialiased")
-    draw_way(axes, way[:, :2])
+    draw_camera_path(axes, eyes[:, :2])
     axes.set(xlabel="metres", ylabel="metres", title=f"{what} from above, ceilings left out")
     color_bar(axes, HEIGHT_COLORS, 0.0, height_range, HEIGHT_LABEL)
     return figure

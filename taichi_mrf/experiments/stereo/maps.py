@@ -318,7 +318,7 @@ def plan_figure(plans: Mapping[str, Result], scene: Scene, voxel_size: float) ->
     figure = new_figure(12.5, (height_in + 0.45) * len(plans) + 0.6)
     axes_of_all = figure.subplots(len(plans), 1, squeeze=False, sharex=True)[:, 0]
     T = scene.views[0].T_world_camera
-    way = np.array([(view.T_world_camera[:3, 3] - T[:3, 3]) @ T[:3, :3] for view in scene.views[::2]])
+    camera_path = np.array([(view.T_world_camera[:3, 3] - T[:3, 3]) @ T[:3, :3] for view in scene.views[::2]])
     for axes, (name, drawn) in zip(axes_of_all, plans.items(), strict=True):
         image = np.full(shape, np.nan)
         row = (np.asarray(drawn["right"], float) - y_low).astype(int)
@@ -335,7 +335,7 @@ def plan_figure(plans: Mapping[str, Result], scene: Scene, voxel_size: float) ->
             (np.asarray(drawn["right"])[wrong] + 0.5) * voxel_size,
             ".", color=ARTEFACT_COLOR, markersize=2.5,
         )  # fmt: skip
-        axes.plot(way[:, 2], way[:, 0], "-", color="black", linewidth=1.0)
+        axes.plot(camera_path[:, 2], camera_path[:, 0], "-", color="black", linewidth=1.0)
         axes.set(
             title=f"{name}: {drawn['artefacts']} artefacts (magenta) at P >= {drawn['occupied_from']:.2f}, "
             f"which covers {100 * drawn['coverage']:.0f} %",

@@ -82,9 +82,9 @@ class KeyframeAllocator:
         footprint: Footprint, no_returns: tuple[NoReturnRays, ...],
     ) -> Keyframe:  # fmt: skip
         """Claim the bricks and return the keyframe, counted in the budget."""
-        self.registry.claim(footprint)
+        visible = self.registry.claim(footprint)
         self.bounds.put(id, footprint.window)
-        placed = (T_world_camera, stamp_s, footprint, self.registry.visible(footprint))
+        placed = (T_world_camera, stamp_s, footprint, visible)
         keyframe = Keyframe(id, name, image, rays, *placed, no_returns=no_returns)
         self.budget.take(keyframe)
         return keyframe

@@ -184,7 +184,7 @@ class Page(BasePage[Panel]):
         if self._hello.located and self.map is not None and is_first:
             self.map.note_earlier()
         self.keyframes.put(keyframe)
-        self.keyframes.draw_way()
+        self.keyframes.draw_path()
         if self.map is not None:
             self.map.move_measured(keyframe.id, keyframe.T_world_camera)
         self.panel.show_keyframes(self.keyframes.keyframes, self.keyframes.chosen)

@@ -120,7 +120,7 @@ class BasePage(Generic[P]):
         """Show all that is seen of the map to one client, or else of its keyframes."""
         points = np.zeros((0, 3)) if self.map is None else self.map.seen_points()
         if not len(points) and (self.options.keyframes or self.options.path):
-            points = self.keyframes.roster.way()[0].reshape(-1, 3)
+            points = self.keyframes.roster.path()[0].reshape(-1, 3)
         if len(points):
             self.viewpoint.look_from(client, side, points)
 

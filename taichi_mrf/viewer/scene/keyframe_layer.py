@@ -32,7 +32,7 @@ LEAST_TO_MERGE = 4096
 
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
-_WAY = (230, 0, 126)
+_PATH = (230, 0, 126)
 _AHEAD = (190, 195, 202)
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
@@ -60,7 +60,7 @@ class ShownKeyframes:
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}
-        self._old_way: list[tuple[bool, float, NDArray[np.float64]]] = []  # of earlier maps or not, stamp
+        self._old_path: list[tuple[bool, float, NDArray[np.float64]]] = []  # of earlier maps or not, stamp
         self._old_crossed: list[NDArray[np.int32]] = []
         self._merged = 0
         self._every, self._forgotten = 1, 0
@@ -75,13 +75,13 @@ class ShownKeyframes:
             self._forget(id)
         return forgotten
 
-    def way(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def path(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The camera's path, lines (n, 2, 3) in metres, world, oldest first, and the stamps (n,) of their
         ends; a long path is thinned out. None leads from an earlier map's last keyframe to the first after
         it."""
-        known = [self.keyframes[id] for id in sorted(self.keyframes)]
-        way = [*self._old_way, *((each.earlier, each.stamp_s, each.T_world_camera[:3, 3]) for each in known)]
-        steps = [(a, b, s) for (before, _, a), (after, s, b) in itertools.pairwise(way) if before == after]
+        known = (self.keyframes[id] for id in sorted(self.keyframes))
+        path = [*self._old_path, *((k.earlier, k.stamp_s, k.T_world_camera[:3, 3]) for k in known)]
+        steps = [(a, b, s) for (before, _, a), (after, s, b) in itertools.pairwise(path) if before == after]
         lines = np.array([step[:2] for step in steps], np.float64).reshape(-1, 2, 3)
         return lines, np.array([step[2] for step in steps])
 
@@ -98,15 +98,15 @@ class ShownKeyframes:
             self._old_crossed = [np.unique(np.concatenate(self._old_crossed), axis=0).astype(np.int32)]
             self._merged = len(self._old_crossed[0])
         if self._forgotten % self._every == 0:
-            self._old_way.append((keyframe.earlier, keyframe.stamp_s, keyframe.T_world_camera[:3, 3]))
+            self._old_path.append((keyframe.earlier, keyframe.stamp_s, keyframe.T_world_camera[:3, 3]))
         self._forgotten += 1
-        if len(self._old_way) > MOST_WAYPOINTS:
-            self._old_way = self._old_way[::2]
+        if len(self._old_path) > MOST_WAYPOINTS:
+            self._old_path = self._old_path[::2]
             self._every *= 2
 
 
 class KeyframeLayer:
-    """Owns the scene nodes /keyframes, /way, /camera and /gizmo."""
+    """Owns the scene nodes /keyframes, /path, /camera and /gizmo."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
@@ -162,24 +162,24 @@ class KeyframeLayer:
         """Highlight the camera's path up to a time; None: all of it."""
         if stamp_s != self._until_s:
             self._until_s = stamp_s
-            self.draw_way()
+            self.draw_path()
 
-    def draw_way(self) -> None:
+    def draw_path(self) -> None:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
-        lines, stamps_s = self.roster.way()
+        lines, stamps_s = self.roster.path()
         if len(lines):
             ahead = np.zeros(len(lines), bool) if self._until_s is None else stamps_s > self._until_s
-            colors = np.where(ahead[:, None], _AHEAD, _WAY).astype(np.uint8)
+            colors = np.where(ahead[:, None], _AHEAD, _PATH).astype(np.uint8)
             colors = np.repeat(colors[:, None], 2, axis=1)
-            draw_lines(self._scene, "/way", lines, colors, visible=self._path)
+            draw_lines(self._scene, "/path", lines, colors, visible=self._path)
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
-        self._outline("/camera", camera.T_world_camera, camera.camera, _WAY, thickness=3.0, enlarged=2.0)
+        self._outline("/camera", camera.T_world_camera, camera.camera, _PATH, thickness=3.0, enlarged=2.0)
         self._show_path()
 
     def _show_path(self) -> None:
-        for name in ("/way", "/camera"):
+        for name in ("/path", "/camera"):
             node = self._scene.get_handle_by_name(name)
             if node is not None:
                 change(node, visible=self._path)
@@ -219,7 +219,7 @@ class KeyframeLayer:
         self._free_places.clear()
         self.roster = ShownKeyframes()
         self.chosen = self._until_s = None
-        for name in ("/way", "/camera"):
+        for name in ("/path", "/camera"):
             self._scene.remove_by_name(name)
 
     def _draw(self, keyframe: KeyframeInfo) -> None:

@@ -100,7 +100,7 @@ class TunePage(BasePage[TunePanel]):
         if not self._has_view:  # another map keeps the user's view
             self._look_inside(keyframe)
         self.keyframes.put(keyframe)
-        self.keyframes.draw_way()
+        self.keyframes.draw_path()
 
     def _look_inside(self, keyframe: m.KeyframeInfo) -> None:
         """Begin where the first keyframe was, and a little behind: from outside, walls hide a room."""
