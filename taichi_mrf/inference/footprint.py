@@ -192,9 +192,10 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
     for group in range(rays.group_number):
         middle, free = block_ray(rays.groups[group], sensor, view), _Mark(FAR)
         apart = end_of_shared_path(rays, group, middle, reach.min_depth, reach.max_depth)
-        begin, end = reach.min_depth, apart
+        begin, end = 0.0, apart  # a sweep begins at the camera
         clip(middle, begin, end, marks.lower, marks.upper)
         shared = _most_voxels(middle, begin, end)
+        begin = ti.max(begin, reach.min_depth)
         walk_bricks(middle, begin, end, marks.shape, marks.kinds, False, _mark_brick, free, marks)
         for i in range(rays.first[group], rays.first[group + 1]):
             measured = rays.depth[i]

@@ -21,15 +21,16 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
-from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.inference.ray_list import RayBundler, block_ray, end_of_shared_path
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, Struct, Template, Vec3
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, CHUNK
-from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 # Written out, and not imported: these tests hold the value.
@@ -273,6 +274,50 @@ def _count_voxels(
         count = _Count(0)
         walk_voxels(ray, begin, end, space, _count_voxel, count, 0)
         out[i] = count.voxels
+
+
+@kernel
+def _count_steps(
+    rays: RayList, sensor: Sensor, view: Viewpoint, space: Space, max_depth: F32,
+    most: I32Array, groups: I32Array,
+) -> None:  # fmt: skip
+    """The most steps that a ray and the shared path of its group have together, as sum_product.send_messages
+    writes them down, and how many groups have a shared path."""
+    for group in range(rays.group_number):
+        middle = block_ray(rays.groups[group], sensor, view)
+        apart = end_of_shared_path(rays, group, middle, 0.0, max_depth)
+        begin, end = 0.0, apart
+        clip(middle, begin, end, space.lower, space.upper)
+        shared = _Count(0)
+        walk_voxels(middle, begin, end, space, _count_voxel, shared, 0)
+        groups[0] += ti.cast(shared.voxels > 0, I32)
+        for i in range(rays.first[group], rays.first[group + 1]):
+            ray = block_ray(rays.blocks[i], sensor, view)
+            begin, end = apart, ti.min(sensor.until(rays.depth[i], rays.last[i]), max_depth)
+            clip(ray, begin, end, space.lower, space.upper)
+            own = _Count(0)
+            walk_voxels(ray, begin, end, space, _count_voxel, own, 0)
+            ti.atomic_max(most[0], shared.voxels + own.voxels)
+
+
+@pytest.mark.parametrize("voxel_size", [0.03, 0.06, 0.1])
+@pytest.mark.parametrize("pose", [*POSES, "through corners"])
+def test_longest_bounds_the_steps_of_a_ray_and_of_its_group(pose: str, voxel_size: float) -> None:
+    """The traces of a sweep have no more room: one step more would be written into the next worker's."""
+    T = POSES.get(pose, look_at((0.8, 0.8, 0.8), (3.0, 3.0, 3.0)))
+    camera = PinholeCamera(160, 120, 130.0, 131.0, 79.5, 59.5)
+    v, u = np.indices(camera.shape)
+    image = uploaded(3.0 + np.sin(u / 30) + 0.6 * np.cos(v / 20), camera=camera)
+    rays = RayBundler(voxel_size, InferenceConfig()).rays_of(image)
+    footprint = find_footprint(image, rays, T, voxel_size, SENSOR, VolumeConfig())
+    window = footprint.window
+    lower, upper = window.clip_box(None, None)
+    chunks, bricks = np.ones(window.cells // CHUNK**3, np.int32), np.zeros(window.cells, np.int32)
+    most, groups = np.zeros((2, 1), np.int32)
+    space = Space(window.shape_vector, lower, upper, chunks, bricks)
+    _count_steps(rays, image.sensor, window.viewpoint(T), space, SENSOR.max_depth, most, groups)
+    assert groups[0] > 10
+    assert most[0] <= footprint.longest < 2 * most[0] + 50
 
 
 @pytest.mark.parametrize("bounded", [False, True])
