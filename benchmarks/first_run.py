@@ -52,8 +52,8 @@ class Options:
 
 @dataclass(frozen=True)
 class FirstRun:
-    """Seconds of one run: its ``stages`` by the clock, the compiler's by kernel, and those of the reference
-    kernel."""
+    """Seconds of one run: its ``stages`` in wall-clock time, the compiler's by kernel, and those of the
+    reference kernel."""
 
     stages: dict[str, float]
     kernels: dict[str, float]
@@ -112,7 +112,7 @@ def _reference(values: F32Array, shift: Template):  # noqa: ANN202 (Taichi allow
 def main(options: Options) -> int:
     """Measure, print and compare; returns the exit status."""
     found = measure()
-    print("stage, seconds by the clock:", ", ".join(f"{name} {s:.1f}" for name, s in found.stages.items()))
+    print("stage, wall-clock seconds:", ", ".join(f"{name} {s:.1f}" for name, s in found.stages.items()))
     for name, seconds in sorted(found.kernels.items(), key=lambda item: -item[1])[:KERNELS]:
         print(f"{seconds:8.2f} s  {name}")
     total = sum(found.kernels.values())

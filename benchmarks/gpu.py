@@ -272,7 +272,7 @@ def _table(report: dict[str, Any], options: Options) -> list[str]:
     for row in clock.get("rows", []):
         least = TARGETS_MS.get(row["voxel_size"])
         lines.append(
-            f"{_cm(row)}: a keyframe with {SWEEPS} sweeps, by the clock {row['seconds'] * 1e3:.2f} ms"
+            f"{_cm(row)}: a keyframe with {SWEEPS} sweeps, wall-clock time {row['seconds'] * 1e3:.2f} ms"
             f"{_target(least, 'ms')}; a sweep has {row['launches_in_a_sweep']} launches, "
             f"{row['waits_in_a_sweep']} of which the host waits for"
         )

@@ -104,7 +104,7 @@ class Walk:
 
 
 class Clock:
-    """Seconds by the clock and of the processors, of the blocks that it watches."""
+    """Wall-clock and CPU seconds of the blocks that it watches."""
 
     def __init__(self) -> None:
         self.wall = self.cpu = 0.0

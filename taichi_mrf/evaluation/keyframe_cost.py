@@ -17,7 +17,7 @@ from taichi_mrf.system.compiler import ti
 
 @dataclass(frozen=True)
 class Seconds:
-    """A duration by the clock (``wall``), and by the processors that worked meanwhile (``cpu``)."""
+    """A duration in wall-clock (``wall``) and in CPU time, of all threads (``cpu``)."""
 
     wall: float
     cpu: float
