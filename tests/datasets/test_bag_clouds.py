@@ -8,7 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_clouds import CAMERA, LIDAR, LOST, SCANS, T_BODY_LIDAR, drive, points, pose, send, stamp, write
+from bag_clouds import (
+    CAMERA,
+    LIDAR,
+    LOST,
+    POSED,
+    SCANS,
+    SWEEPS_WITHOUT_POSES,
+    T_BODY_LIDAR,
+    drive,
+    points,
+    pose,
+    send,
+    stamp,
+    sweeps,
+    write,
+)
 from inputs_bags import Bag, Kind, Make, mounted, plain
 from numpy.typing import NDArray
 from point_clouds import in_order
@@ -105,6 +120,66 @@ def test_a_motion_that_is_left_in_though_points_have_times_is_told(make: Make) -
     assert undone.stated.swept_m == 0.0
     for other in (undone, opened(""), opened("?deskew=false", time=0 * times)):
         assert not any(said in note for note in other.notes)
+
+
+@pytest.mark.parametrize("kind", SWEEPS_WITHOUT_POSES)
+def test_a_scan_with_points_that_have_no_pose_is_left_out(make: Make, kind: str) -> None:
+    first_s, last_s, posed, kept = SWEEPS_WITHOUT_POSES[kind]
+    path = make(partial(sweeps, first_s=first_s, last_s=last_s, posed=posed), kind="mcap")
+    dataset = open_dataset(path)
+    assert (dataset.frame_names, dataset.dropped) == (kept, 1)
+    said = "1 of 3 clouds of /points dropped: none has poses, at most 0.2 s apart, from its first point to"
+    assert sum(note.startswith(said) for note in dataset.notes) == 1
+    whole = make(partial(sweeps, first_s=first_s, last_s=last_s, posed=POSED), kind="mcap", name="whole")
+    undone = {frame.name: frame for frame in open_dataset(whole)}
+    assert len(undone) == 3
+    for frame in dataset:
+        np.testing.assert_array_equal(frame.points_m, undone[frame.name].points_m)
+    rigid = open_dataset(f"{path}?deskew=false")
+    assert (len(rigid), rigid.dropped) == (3, 0)
+
+
+def test_poses_as_far_apart_as_around_a_stamp_undo_motion(make: Make) -> None:
+    """Odometry at 10 Hz that misses one pose; the last cloud ends at the last pose."""
+    posed = np.delete(np.arange(15, 42) / 10, 16)  # without 3.1 s
+    path = make(partial(sweeps, first_s=0.0, last_s=0.1, posed=posed), kind="mcap")
+    dataset = open_dataset(path)
+    assert (len(dataset), dataset.dropped) == (3, 0)
+    whole = make(partial(sweeps, first_s=0.0, last_s=0.1, posed=POSED), kind="mcap", name="whole")
+    for ours, theirs in zip(dataset, open_dataset(whole), strict=True):
+        assert np.linalg.norm(ours.points_m - theirs.points_m, axis=-1).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("at", "said"),
+    [
+        ((2.0, 3.0, 4.0), "the lidar moves by 0.59 m in a scan, turns counted at 10 m, which is not"),
+        ((2.0,), "the lidar's motion in a scan is not undone, though"),
+    ],
+)
+def test_poses_at_the_stamps_alone_leave_motion_in_which_is_told(
+    make: Make, at: tuple[float, ...], said: str
+) -> None:
+    dataset = open_dataset(make(partial(sweeps, first_s=0.0, last_s=0.08, posed=at, at=at), kind="mcap"))
+    assert (len(dataset), dataset.dropped) == (len(at), 0)
+    for i, frame in enumerate(dataset):
+        expected = np.linalg.norm(points(i), axis=-1)
+        np.testing.assert_allclose(frame.depth_m[~LOST], expected[~LOST], rtol=1e-6)
+    (note,) = (note for note in dataset.notes if "not undone" in note)
+    assert note.startswith(f"/points: {said}")
+    assert note.endswith("denser poses are needed, or a larger --max-time-gap")
+
+
+def test_nothing_is_told_of_motion_where_the_lidar_stands_still_at_first(make: Make) -> None:
+    def path(at: float) -> NDArray[np.float64]:
+        return pose(max(0.0, at - 2.5))
+
+    at = tuple(np.arange(20, 40) / 10)
+    dataset = open_dataset(
+        make(partial(sweeps, first_s=0.0, last_s=0.08, posed=POSED, at=at, path=path), kind="mcap")
+    )
+    assert not any("not undone" in note for note in dataset.notes)
+    assert dataset.stated.swept_m == 0.0
 
 
 def test_free_rays_start_where_their_points_were_measured(make: Make) -> None:

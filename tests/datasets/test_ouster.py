@@ -15,7 +15,7 @@ from datasets_recordings import write_stamped
 from numpy.typing import NDArray
 from refusals import refused
 
-from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.lidar.ouster import NOMINAL_M, Beams
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
@@ -189,6 +189,26 @@ def test_poses_of_a_file(played: Play, tmp_path: Path) -> None:
     expected = T @ Beams.of(metadata()).T_sensor_lidar
     np.testing.assert_allclose(dataset.read(0).T_world_camera, expected, atol=1e-6)
     assert open_dataset(f"{recording}?poses=track").tracked
+
+
+def test_a_scan_that_poses_of_a_file_cover_in_part_is_left_out(played: Play, tmp_path: Path) -> None:
+    recording = played(Source([STILL, STILL, STILL]))
+
+    def opened(times: NDArray, query: str = "") -> Dataset:
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, 0, 3] = 10.0 * (times - 10.0)
+        return open_dataset(f"{recording}?poses={write_stamped(tmp_path / 'walk.txt', times, poses)}{query}")
+
+    late = np.arange(1004, 1034, 2) / 100  # from within the first scan on
+    dataset = opened(late)
+    assert (dataset.frame_names, dataset.dropped) == (["000001", "000002"], 1)
+    assert any(note.startswith("1 of 3 scans dropped: none has poses") for note in dataset.notes)
+    assert all(frame.camera.origins_m is not None for frame in dataset)
+    assert len(opened(late, "&deskew=false")) == 3
+    middles = open_dataset(recording).stamps()
+    alone = opened(np.array([middles[0], middles[0] + 5]))
+    assert (len(alone), alone.dropped) == (1, 2)
+    assert any("the lidar's motion in a scan is not undone" in note for note in alone.notes)
 
 
 @pytest.mark.parametrize(

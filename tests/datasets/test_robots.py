@@ -287,6 +287,25 @@ def test_a_cloud_is_left_out_where_poses_end_before_its_last_point(
     assert "2 left out: no poses within 0.1 s" in live.awaiting()
 
 
+@pytest.mark.parametrize("kind", bag_clouds.SWEEPS_WITHOUT_POSES)
+def test_a_cloud_with_points_that_have_no_pose_is_left_out_as_of_a_bag(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(stream, "LATE_S", 0.0)
+    first_s, last_s, posed, kept = bag_clouds.SWEEPS_WITHOUT_POSES[kind]
+    parts = partial(bag_clouds.sweeps, first_s=first_s, last_s=last_s, posed=posed)
+    sender, live, bag = begin(parts, first=3 + int((posed < 2.0).sum()))
+    found = one_by_one(sender, live)
+    if kind == "poses end at the last stamp":
+        assert came(live) == 3  # and the last waits
+    else:
+        assert "1 left out: no poses within 0.1 s on both sides" in live.awaiting()
+    for ours, theirs in zip(found, open_dataset(bag), strict=True):
+        assert ours.name == theirs.name
+        np.testing.assert_array_equal(ours.points_m, theirs.points_m)
+    assert [frame.name for frame in found] == kept
+
+
 def test_each_image_has_the_camera_of_its_time(begin: Begin) -> None:
     other, small = PinholeCamera(16, 12, 21.0, 22.0, 7.5, 5.5), PinholeCamera(8, 6, 7.0, 7.5, 3.5, 2.5)
     cameras = [CAMERA, CAMERA, other, small, small]

@@ -1,5 +1,6 @@
 """Writes bags with the point clouds of a lidar on a robot that drives and turns."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,33 @@ def drive(bag: Bag) -> None:
         stamp = 0.9 + 0.05 * i
         bag.odometry("/odom", stamp, "odom", BODY, pose(stamp))
     bag.tf("/tf_static", 0.0, BODY, LIDAR, T_BODY_LIDAR)
+
+
+def sweeps(
+    bag: Bag, first_s: float, last_s: float, posed: Sequence[float], at: Sequence[float] = (2.0, 3.0, 4.0),
+    path: Callable[[float], Pose] = pose,
+) -> None:  # fmt: skip
+    """Clouds ``at`` these stamps, whose columns are measured from ``first_s`` after it to ``last_s``, with
+    odometry of a body on a ``path`` at the times ``posed``."""
+    seconds = np.tile(np.linspace(first_s, last_s, CAMERA.width, dtype=np.float32), (CAMERA.height, 1))
+    for i, each in enumerate(at):
+        send(bag, each, points(i), time=seconds)
+    for each in posed:
+        bag.odometry("/odom", each, "odom", BODY, path(each))
+    bag.tf("/tf_static", 0.0, BODY, LIDAR, T_BODY_LIDAR)
+
+
+POSED = np.arange(30, 94) / 20
+"""Poses at 20 Hz from 1.5 s to 4.65 s, around all clouds."""
+
+SWEEPS_WITHOUT_POSES: dict[str, tuple[float, float, NDArray[np.float64], list[str]]] = {
+    "poses end at the last stamp": (0.0, 0.08, POSED[POSED <= 4.0], ["000000", "000001"]),
+    "poses begin after the first point": (-0.08, 0.0, POSED[POSED >= 2.0], ["000001", "000002"]),
+    "a hole in mid-sweep": (
+        -0.3, 0.45, POSED[(POSED < 3.07) | (POSED > 3.38)], ["000000", "000002"]
+    ),
+}  # fmt: skip
+"""When the first and last column are measured, the times of poses, and the clouds with poses through it."""
 
 
 def stamp(scan: int) -> float:

@@ -35,6 +35,7 @@ from taichi_mrf.datasets.lidar.scans import (
     Scan,
     reach_of,
     refuse_image_options,
+    through_scans,
 )
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import (
@@ -235,7 +236,7 @@ class OusterScans(LidarRecording, Table[NumberedRow]):
             columns = columns_of(self.source, row.number, self.sensor)
         if columns is None:
             raise DatasetError(f"{self.path}: it has no column")
-        at = _poses(columns, self.trajectory, self.gap)
+        at = _poses(columns, self.trajectory, 2 * self.gap)
         range_m = self.beams.from_centre(self.beams.shifted(columns.range_m))
         measured = range_m > 0
         looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
@@ -289,6 +290,12 @@ def _poses(columns: Columns, trajectory: TimedPoses | None, gap: float) -> PoseA
     return lambda stamp: timed.at(stamp, largest_s)
 
 
+def _is_posed(columns: Columns, stamp: float, pose: Pose | None, trajectory: TimedPoses, gap: float) -> bool:
+    """True if a ``trajectory`` goes from the first column of the scan at a ``stamp`` to the last."""
+    at = _poses(columns, trajectory, 2 * gap)
+    return pose is not None and Motion(stamp, pose, at).is_known(columns.stamps[columns.valid] - stamp)
+
+
 def _pose(path: Path, T_world_sensor: Pose | None, T_sensor_lidar: Pose) -> Pose:
     if T_world_sensor is None:
         raise DatasetError(f"{path}: its pose is not known")
@@ -312,6 +319,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     beams = _beams(path, source, chosen.sensor)
     scans: list[NumberedRow] = []
     at: list[Pose | None] = []
+    through: list[bool] = []
     ends: list[Pose] = []
     reach_m = None
     for number in range(count):
@@ -326,6 +334,8 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         at.append(np.eye(4) if tracked else _poses(columns, trajectory, gap)(stamp))
         pose = partial(_pose, path, at[-1], beams.T_sensor_lidar)
         scans.append(NumberedRow(f"{number:06d}", stamp, pose, str(path), number))
+        if trajectory is not None:
+            through.append(_is_posed(columns, stamp, at[-1], trajectory, gap))
         ends += [columns.poses.poses[0], columns.poses.poses[-1]]
         if reach_m is None and at[-1] is not None and columns.range_m.any():
             reach_m = reach_of(columns.range_m)
@@ -333,13 +343,18 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         raise DatasetError(f"{path}: none of its {count} scans can be read")
     damaged = count - len(scans)
     notes = [f"{damaged} of {count} scans dropped: damaged, or without a column"] if damaged else []
+    rigid = ""
     if trajectory is not None:
         stamps = [scan.stamp for scan in scans]
         posed, said_of = within_gap(stamps, at, gap, "scans", str(path), chosen.poses, trajectory.stamps)
         scans, notes = [scans[i] for i, _ in posed], notes + said_of
+        if chosen.deskew:
+            known = [through[i] for i, _ in posed]
+            scans, dropped, rigid = through_scans(scans, known, "scans", len(stamps), gap)
+            notes += dropped
     elif not tracked and all(np.array_equal(pose, ends[0]) for pose in ends):
         notes.append(STANDS_STILL)
-    return OusterScans(
+    found = OusterScans(
         path.stem,
         beams.camera,
         notes,
@@ -351,10 +366,13 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         rows=scans,
         trajectory=trajectory,
         gap=gap,
-        deskew=chosen.deskew,
+        deskew=chosen.deskew and not rigid,
         tracked=tracked,
         reach_m=reach_m,
     )
+    if rigid:
+        found.note_motion(str(path), rigid)
+    return found
 
 
 def _open(path: Path, chosen: OusterOptions) -> tuple[Any, int]:

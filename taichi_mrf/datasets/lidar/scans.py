@@ -14,6 +14,7 @@ import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ PoseAt = Callable[[float], Pose | None]
 _FAR_M = 10.0
 _LOOKED_UP, _POSES_A_SCAN = 16, 1024
 """Poses are looked up so many times during a scan, and interpolated for so many columns."""
+
+_ROUNDED = 1e-5
+"""Share by which a point's time may be later than the last pose, or earlier than the first, by rounding."""
 
 _WIDEST = 1.5
 """An image that would become wider than this share has no columns that follow each other in time."""
@@ -61,10 +65,8 @@ class Motion:
         if it moved less than its noise, if all times are one, or not all poses are known."""
         if not np.isfinite(seconds).all() or seconds.max() == seconds.min():
             return None
-        first, last = float(seconds.min()), float(seconds.max())
-        poses = [self.at(self.stamp + time) for time in np.linspace(first, last, _LOOKED_UP)]
-        known = [pose for pose in poses if pose is not None]
-        if len(known) < _LOOKED_UP:
+        first, last, known = float(seconds.min()), float(seconds.max()), self._looked_up(seconds)
+        if known is None:
             return None
         rotation, translation = tangent_norms(known[0], known[-1])
         if _FAR_M * rotation + translation < LIDAR_SIGMA_M:
@@ -76,6 +78,24 @@ class Motion:
         T = interpolate(T_lidar_then[before], T_lidar_then[before + 1], place - before)
         column = np.rint((seconds - first) / (last - first) * (_POSES_A_SCAN - 1)).astype(int)
         return T[column]
+
+    def is_known(self, seconds: NDArray[np.float64]) -> bool:
+        """True if poses are known from the first of the times (...) after the stamp in seconds to the last,
+        or all times are one. Times that are not finite do not count."""
+        times = seconds[np.isfinite(seconds)]
+        return times.size == 0 or times.max() == times.min() or self._looked_up(times) is not None
+
+    def _looked_up(self, seconds: NDArray[np.float64]) -> list[Pose] | None:
+        """T_world_lidar at times that are spread from the first of ``seconds`` to the last, None if one of
+        them is not known."""
+        known = []
+        for time in np.linspace(float(seconds.min()), float(seconds.max()), _LOOKED_UP):
+            pose = self.at(self.stamp + time)
+            pose = self.at(self.stamp + time * (1 - _ROUNDED)) if pose is None else pose
+            if pose is None:
+                return None
+            known.append(pose)
+        return known
 
     def of_image(self, scan: Scan, seconds: NDArray[np.float64], known: NDArray[np.bool_]) -> Scan | None:
         """A scan that was measured at times (H, W) after the stamp, of which some are ``known`` (H, W), with
@@ -203,6 +223,15 @@ class LidarRecording(Dataset):
         swept_m = float(np.median(moved_m)) if moved_m else 0.0
         return swept_m if swept_m > LIDAR_SIGMA_M else 0.0
 
+    def note_motion(self, what: str, why: str) -> None:
+        """Set how far the lidar moves during scans (``what``), and say that it is not undone, and why."""
+        self.swept_m = self._swept_m()
+        if len(self) > 1 and not self.swept_m:
+            return
+        moves = f"the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at 10 m, which is"
+        moves = moves if self.swept_m else "the lidar's motion in a scan is"
+        self.notes.append(f"{what}: {moves} not undone, though its points have times: {why}")
+
     @property
     def stated(self) -> StatedSensor:
         """Facts that are assumed for every lidar, and the largest range of the first scan."""
@@ -251,6 +280,9 @@ class RecordedScan(Row):
     starts: Callable[[], NDArray[np.float64]] | None = None
 
 
+AnyScan = TypeVar("AnyScan")
+
+
 @dataclass
 class LidarScans(LidarRecording, Table[RecordedScan]):
     """Scans of free rays. ``camera`` and ``reach_m`` are those of the first scan that can be read."""
@@ -296,6 +328,20 @@ def lidar_scans(
     )  # fmt: skip
     found.look_at_first("scan")
     return found
+
+
+def through_scans(
+    scans: Sequence[AnyScan], known: Sequence[bool], what: str, count: int, gap: float
+) -> tuple[list[AnyScan], list[str], str]:
+    """The scans of which poses are ``known`` from the first point to the last, with a note that counts the
+    others among ``count``. If there are none the motion during scans cannot be undone: all scans, and why.
+    ``gap`` is the largest time to a neighbouring pose in seconds, of which two lie between two poses."""
+    found = [scan for scan, is_known in zip(scans, known, strict=True) if is_known]
+    poses = f"poses, at most {2 * gap:g} s apart, from its first point to its last"
+    if not found:
+        return list(scans), [], f"no scan has {poses}; denser poses are needed, or a larger --max-time-gap"
+    dropped = len(scans) - len(found)
+    return found, [f"{dropped} of {count} {what} dropped: none has {poses}"] if dropped else [], ""
 
 
 def refuse_image_options(name: str, options: ReadOptions, takes_scale: bool = False) -> None:

@@ -28,7 +28,7 @@ from taichi_mrf.datasets.images import note_of_largest
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.beside import Beside, find_colors, find_confidence, find_imu
-from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds
+from taichi_mrf.datasets.ros.lidar import LidarBag, find_clouds, maps_clouds, posed_through
 from taichi_mrf.datasets.ros.poses import BagPoses, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import (
@@ -237,13 +237,19 @@ def _open_lidar(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -
     sensor, found, clouds = find_clouds(reader, chosen, options)
     tracked = chosen.poses == TRACK
     posed, notes = posed_by(sensor, found, options)
+    posed, dropped, rigid = posed_through(sensor, found, clouds, posed, options)
+    if rigid:
+        clouds = replace(clouds, at=None)
+    elif not chosen.deskew and not tracked:
+        rigid = "leave out deskew=false"
     bag = LidarBag(
         name=reader.path.stem,
         camera=RayTable([[1.0, 0.0, 0.0]]),
-        notes=notes,
+        notes=notes + dropped,
         dropped=len(sensor.entries) - len(posed),
         reader=reader,
         clouds=clouds,
+        rigid=rigid,
         rows=_rows(reader, posed),
         track=None if tracked or clouds.registered else track_of(found, options),
         tracked=tracked,

@@ -24,12 +24,13 @@ from taichi_mrf.datasets.lidar.scans import (
     Scan,
     measured_points,
     refuse_image_options,
+    through_scans,
 )
 from taichi_mrf.datasets.options import TRACK, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
-from taichi_mrf.datasets.ros.sensor import BagSensor, SensorChoice, find_sensor, poses_of
+from taichi_mrf.datasets.ros.sensor import BagSensor, Posed, SensorChoice, find_sensor, poses_of
 from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.topics import choose, cloud_topics, depth_topics
 from taichi_mrf.datasets.timed_poses import largest_gap
@@ -241,10 +242,12 @@ def _filled(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 @dataclass
 class LidarBag(LidarRecording, Table[BagRow]):
-    """The point clouds of one topic, each with its pose."""
+    """The point clouds of one topic, each with its pose. ``rigid``: why motion during scans is not undone,
+    though their points have times."""
 
     reader: RosReader = field(kw_only=True)
     clouds: "Clouds" = field(kw_only=True)
+    rigid: str = field(default="", kw_only=True)
 
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one cloud, which must have a measurement."""
@@ -258,11 +261,10 @@ class LidarBag(LidarRecording, Table[BagRow]):
         self.notes.append(self.clouds.in_words(self.camera))
         if self.clouds.registered:
             self.swept_m = 0.0
-        elif self.swept_m and self._has_times():
-            self.notes.append(
-                f"{self.clouds.topic}: the lidar moves by {self.swept_m:.2f} m in a scan, turns counted at "
-                "10 m, which is not undone, though its points have times: leave out deskew=false"
-            )
+        elif self.rigid and self._has_times():
+            self.note_motion(self.clouds.topic, self.rigid)
+        elif self.swept_m and self._has_times():  # the first scan stood still
+            self.swept_m = 0.0
 
     def _has_times(self) -> bool:
         """True if points of the first cloud have times that differ."""
@@ -307,6 +309,19 @@ class Clouds:
             return entry.stamp
         return entry.stamp + (0.0 if seconds is None else max(0.0, float(np.nanmax(seconds))))
 
+    def is_posed(self, entry: Entry, message: Any, pose: Pose) -> bool:
+        """True if poses are known from a cloud's first point to its last, or are not asked for."""
+        if self.at is None:
+            return True
+        try:
+            cloud = decode(message, entry.stamp)
+        except DatasetError:  # as above
+            return True
+        if cloud.seconds is None:
+            return True
+        motion = Motion(entry.stamp, pose, partial(self.at, entry.frame))
+        return motion.is_known(cloud.seconds[measured_points(cloud.points_m)])
+
     def in_words(self, camera: Camera) -> str:
         """A note of the rays of a camera."""
         pattern = isinstance(camera, RayTable) and camera.has_pattern
@@ -336,8 +351,30 @@ def find_clouds(
     if tracked:
         found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
     gap, deskews = largest_gap(options), choice.deskew and not tracked and not registered
-    at = (lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None
+    # As far apart as the neighbours of a scan's stamp may be: it has one within the gap on both sides.
+    at = (lambda frame, stamp: found[frame].at(stamp, 2 * gap)) if deskews else None
     return sensor, found, Clouds(reader.path, topic, at, registered)
+
+
+def posed_through(
+    sensor: BagSensor, found: dict[str, BagPoses], clouds: Clouds, posed: Posed, options: ReadOptions
+) -> tuple[Posed, list[str], str]:
+    """Of clouds with a pose those with poses from the first point to the last, as :func:`through_scans`. Only
+    those near a time without poses are read."""
+    gap = largest_gap(options)
+    if clouds.at is None:
+        return posed, [], ""
+    stamps = np.array([entry.stamp for _, entry, _ in posed])
+    doubtful = np.zeros(len(posed), bool)
+    for frame, poses in found.items():
+        of_frame = np.array([entry.frame == frame for _, entry, _ in posed])
+        near = poses.lacking(stamps - _LONGEST_SCAN_S, stamps + _LONGEST_SCAN_S, 2 * gap)
+        doubtful |= of_frame & near
+    known = [
+        not is_doubtful or clouds.is_posed(entry, sensor.reader.read(clouds.topic, entry), pose)
+        for is_doubtful, (_, entry, pose) in zip(doubtful, posed, strict=True)
+    ]
+    return through_scans(posed, known, f"clouds of {clouds.topic}", len(sensor.entries), gap)
 
 
 def _image(cloud: Cloud, motion: Motion | None) -> Scan | None:

@@ -94,6 +94,20 @@ class BagPoses:
         again = [each for each in self.moving if len(each) > 1] or self.moving
         return min((float(each.stamps.max(initial=-math.inf)) for each in again), default=math.inf)
 
+    def lacking(
+        self, first: NDArray[np.float64], last: NDArray[np.float64], largest_gap: float
+    ) -> NDArray[np.bool_]:
+        """Which spans of time, from ``first`` to ``last`` (N,) in seconds, meet one between two poses that is
+        longer than ``largest_gap``, or that is before all poses or after them."""
+        moving = [each.stamps for each in self.moving if len(each) > 1 and not each.stands_still]
+        found = np.zeros(len(first), bool)
+        for stamps in moving or [np.asarray(self.stamps, np.float64)]:
+            known = np.concatenate([[-np.inf], stamps, [np.inf]])
+            (before,) = np.nonzero(np.diff(known) > largest_gap)
+            ends_after = np.searchsorted(known[before + 1], first, side="right")
+            found |= known[before][ends_after] < last
+        return found
+
 
 def pose_candidates(reader: TopicSource, tree: TransformTree, optical: str) -> list[str]:
     """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree; without

@@ -95,6 +95,10 @@ class Robot(Dataset):
         """The time in seconds up to which poses are needed for a message."""
         return entry.stamp
 
+    def is_posed(self, heard: Heard, pose: Pose) -> bool:
+        """True if poses are known for all of a message that has one at its stamp."""
+        return True
+
     def complete(self, posed: Posed) -> tuple[Posed, bool]:
         """A message with what belongs to it on other topics so far, and whether that has come."""
         return posed, True
@@ -190,7 +194,7 @@ class Robot(Dataset):
             entry = image.heard.entry
             known = self.poses.get(entry.frame)
             pose = None if known is None or image.until_s > known.until else known.at(entry.stamp, self.gap)
-            if pose is None:
+            if pose is None or not self.is_posed(image.heard, pose):
                 self.dropped += 1
                 continue
             self.skipped += self._next is not None
@@ -345,6 +349,10 @@ class LidarRobot(Robot, LidarRecording):
     def until(self, entry: Entry, message: Any) -> float:
         """When its last point was measured."""
         return self.clouds.until(entry, message)
+
+    def is_posed(self, heard: Heard, pose: Pose) -> bool:
+        """True if there are poses from its first point to its last."""
+        return self.clouds.is_posed(heard.entry, heard.message, pose)
 
 
 def _in_words(seconds: float) -> str:
