@@ -30,7 +30,7 @@ class SourceFlags(OwnBody):
     """Read 1/n of the rows and columns: 1, 0.5, 0.333, 0.25, ... Pixels are dropped, not averaged."""
 
     max_time_gap: float | None = None
-    """Largest difference in seconds between a depth image and the poses on either side of it."""
+    """Largest time in seconds from a depth image to a pose; two around it may be twice this apart."""
 
     poses_are: str | None = None
     """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, with commas between: inverse

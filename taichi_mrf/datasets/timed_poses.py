@@ -159,18 +159,19 @@ class TimedPoses:
     def at(self, stamp: float, largest_gap: float) -> Pose | None:
         """The pose (4, 4) at a time, or None.
 
-        It is None outside the trajectory, and where one of the two neighbours in time is further than
-        ``largest_gap`` seconds away. A pose with this very stamp is its own neighbour on both sides.
+        It is None outside the trajectory, and where the two neighbours in time are more than twice
+        ``largest_gap`` seconds apart: a time midway between them is then further from both. A pose with this
+        very stamp is its own neighbour on both sides.
         """
         after = int(np.searchsorted(self.stamps, stamp))
         # A little wider than the gap, to absorb the rounding of a difference.
-        window = largest_gap + 2 * np.spacing(abs(stamp) + largest_gap)
+        window = 2 * largest_gap + 4 * np.spacing(abs(stamp) + largest_gap)
         if after < len(self) and self.stamps[after] == stamp:
             return self.poses[after].copy()
         if not 0 < after < len(self):
             return None
         first, last = self.stamps[after - 1], self.stamps[after]
-        if max(stamp - first, last - stamp) > window:
+        if last - first > window:
             return None
         return interpolate(self.poses[after - 1], self.poses[after], (stamp - first) / (last - first))
 

@@ -332,7 +332,8 @@ def ramp() -> TimedPoses:
         (1.0, 0.0, 1.0),  # a pose of that very stamp needs no neighbour
         (1.5, 0.0, 1.5),
         (1.05, 0.06, 1.05),
-        (1.02, 0.06, None),  # the neighbour on the other side is too far
+        (1.02, 0.06, 1.02),  # one neighbour is further, but the two are near each other
+        (1.02, 0.049, None),  # they are too far apart for a time midway, and so for all
         (1.05, 0.05, 1.05),  # just near enough, whatever the rounding
         (1.25, 0.14, None),
         (1.25, 0.15, 1.25),

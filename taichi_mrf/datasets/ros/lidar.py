@@ -351,8 +351,7 @@ def find_clouds(
     if tracked:
         found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
     gap, deskews = largest_gap(options), choice.deskew and not tracked and not registered
-    # As far apart as the neighbours of a scan's stamp may be: it has one within the gap on both sides.
-    at = (lambda frame, stamp: found[frame].at(stamp, 2 * gap)) if deskews else None
+    at = (lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None
     return sensor, found, Clouds(reader.path, topic, at, registered)
 
 
