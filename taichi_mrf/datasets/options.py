@@ -37,8 +37,8 @@ class ReadOptions:
     """Read the colour images too, where there are any."""
 
     max_time_gap: float | None = None
-    """Largest time in seconds from a depth image to the nearest pose: those around it may be twice this apart.
-    None is the format's default."""
+    """Largest time in seconds from a depth image to a pose; two around it may be twice this apart. None is
+    the format's default."""
 
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy in pixels: as ``camera``, with the image size of the recording."""
