@@ -192,22 +192,24 @@ def test_poses_of_a_file(played: Play, tmp_path: Path) -> None:
 
 
 def test_a_scan_that_poses_of_a_file_cover_in_part_is_left_out(played: Play, tmp_path: Path) -> None:
-    recording = played(Source([STILL, STILL, STILL]))
+    recording = played(Source([STILL] * 5))
 
     def opened(times: NDArray, query: str = "") -> Dataset:
         poses = np.tile(np.eye(4), (len(times), 1, 1))
         poses[:, 0, 3] = 10.0 * (times - 10.0)
         return open_dataset(f"{recording}?poses={write_stamped(tmp_path / 'walk.txt', times, poses)}{query}")
 
-    late = np.arange(1004, 1034, 2) / 100  # from within the first scan on
+    late = np.arange(1004, 1054, 2) / 100  # from within the first scan on
     dataset = opened(late)
-    assert (dataset.frame_names, dataset.dropped) == (["000001", "000002"], 1)
-    assert any(note.startswith("1 of 3 scans dropped: none has poses") for note in dataset.notes)
+    assert (dataset.frame_names, dataset.dropped) == ([f"{i:06d}" for i in range(1, 5)], 1)
+    assert any(note.startswith("1 of 5 scans dropped: none has poses") for note in dataset.notes)
     assert all(frame.camera.origins_m is not None for frame in dataset)
-    assert len(opened(late, "&deskew=false")) == 3
+    assert len(opened(late, "&deskew=false")) == 5
+    holed = opened(late[(late < 10.07) | (late > 10.32)])  # 0.28 s: more than twice the gap
+    assert (holed.frame_names, holed.dropped) == (["000004"], 4)
     middles = open_dataset(recording).stamps()
     alone = opened(np.array([middles[0], middles[0] + 5]))
-    assert (len(alone), alone.dropped) == (1, 2)
+    assert (len(alone), alone.dropped) == (1, 4)
     assert any("the lidar's motion in a scan is not undone" in note for note in alone.notes)
 
 

@@ -108,6 +108,9 @@ SWEEPS_WITHOUT_POSES: dict[str, tuple[float, float, NDArray[np.float64], list[st
     "a hole in mid-sweep": (
         -0.3, 0.45, POSED[(POSED < 3.07) | (POSED > 3.38)], ["000000", "000002"]
     ),
+    "a hole of just over 0.2 s in mid-sweep": (
+        -0.3, 0.45, POSED[(POSED < 3.12) | (POSED > 3.33)], ["000000", "000002"]
+    ),
 }  # fmt: skip
 """When the first and last column are measured, the times of poses, and the clouds with poses through it."""
 

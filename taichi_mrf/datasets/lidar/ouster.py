@@ -236,7 +236,7 @@ class OusterScans(LidarRecording, Table[NumberedRow]):
             columns = columns_of(self.source, row.number, self.sensor)
         if columns is None:
             raise DatasetError(f"{self.path}: it has no column")
-        at = _poses(columns, self.trajectory, 2 * self.gap)
+        at = _poses(columns, self.trajectory, self.gap)
         range_m = self.beams.from_centre(self.beams.shifted(columns.range_m))
         measured = range_m > 0
         looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
@@ -292,7 +292,7 @@ def _poses(columns: Columns, trajectory: TimedPoses | None, gap: float) -> PoseA
 
 def _is_posed(columns: Columns, stamp: float, pose: Pose | None, trajectory: TimedPoses, gap: float) -> bool:
     """True if a ``trajectory`` goes from the first column of the scan at a ``stamp`` to the last."""
-    at = _poses(columns, trajectory, 2 * gap)
+    at = _poses(columns, trajectory, gap)
     return pose is not None and Motion(stamp, pose, at).is_known(columns.stamps[columns.valid] - stamp)
 
 
