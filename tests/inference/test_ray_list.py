@@ -1,5 +1,7 @@
 """The list of rays: blocks that agree, the rest pixel by pixel, and nothing twice; groups of whole blocks."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,6 +21,7 @@ from taichi_mrf.inference.ray_list import (
 from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.system import runtime
 
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
@@ -103,18 +106,20 @@ def _part(image: NDArray, block: Block) -> NDArray:
 @settings(max_examples=40)
 @given(
     width=st.integers(1, 75), height=st.integers(1, 70), wanted=st.sampled_from([1.0, 4.0, 9.0]),
-    steepness=st.floats(0, 0.05), seed=st.integers(0, 2**20),
+    steepness=st.floats(0, 0.05), seed=st.integers(0, 2**20), on_gpu=st.booleans(),
 )  # fmt: skip
 def test_bundles_are_those_of_the_oracle(
-    width: int, height: int, wanted: float, steepness: float, seed: int
+    width: int, height: int, wanted: float, steepness: float, seed: int, on_gpu: bool
 ) -> None:
+    """Tile by tile as on a CPU, and level by level as on a GPU."""
     random = np.random.default_rng(seed)
     v, u = np.mgrid[:height, :width]
     depth = 0.4 + steepness * (u + v) + random.uniform(-0.02, 0.02, (height, width))
     depth[(u - width / 2) ** 2 + (v - height / 2) ** 2 < (height / 4) ** 2] += 1.0  # a rim
     depth[random.random((height, width)) < 0.02] = 0
     depth = depth.astype(np.float32)
-    rays = listed(depth, ray_density=wanted / 10)
+    with patch.object(runtime, "on_gpu", lambda: on_gpu):
+        rays = listed(depth, ray_density=wanted / 10)
     expected = oracle(depth, wanted / 10)
     found = dict(blocks_of(rays, width))
     # float32 may round a spread or a quotient that lies at its bound to the other side.
