@@ -170,6 +170,28 @@ def test_poses_at_the_stamps_alone_leave_motion_in_which_is_told(
     assert note.endswith("denser poses are needed, or a larger --max-time-gap")
 
 
+TIMES = np.tile(np.linspace(0.0, 0.08, CAMERA.width, dtype=np.float32), (CAMERA.height, 1))
+
+WITHOUT_TIMES = {
+    "broken": (points(3)[:, :0], TIMES[:, :0]),
+    "empty": (np.full_like(points(3), np.nan), TIMES),
+    "at one time": (points(3), 0 * TIMES),
+}
+"""Clouds, and times of their points, for which no pose is asked besides that at the stamp."""
+
+
+@pytest.mark.parametrize("kind", WITHOUT_TIMES)
+def test_a_cloud_without_times_is_no_proof_that_poses_are_dense(make: Make, kind: str) -> None:
+    """Poses at the stamps alone: the other clouds stay, with their motion in them."""
+    at, (values, times) = (2.0, 3.0, 4.0, 5.0), WITHOUT_TIMES[kind]
+    sparse = partial(sweeps, first_s=0.0, last_s=0.08, posed=at, at=at[:3])
+    dataset = open_dataset(make(sparse, cloud(5.0, values, time=times), kind="mcap"))
+    assert list(dataset.frame_names) == [f"{i:06d}" for i in range(4)]
+    assert dataset.dropped == 0
+    (note,) = (note for note in dataset.notes if "not undone" in note)
+    assert note.endswith("denser poses are needed, or a larger --max-time-gap")
+
+
 def test_nothing_is_told_of_motion_where_the_lidar_stands_still_at_first(make: Make) -> None:
     def path(at: float) -> NDArray[np.float64]:
         return pose(max(0.0, at - 2.5))

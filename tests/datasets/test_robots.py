@@ -306,6 +306,22 @@ def test_a_cloud_with_points_that_have_no_pose_is_left_out_as_of_a_bag(
     assert [frame.name for frame in found] == kept
 
 
+def test_clouds_of_a_robot_with_poses_at_their_stamps_alone_stay_as_those_of_a_bag(begin: Begin) -> None:
+    at = tuple(np.arange(8) / 2 + 2.0)
+    parts = partial(bag_clouds.sweeps, first_s=0.0, last_s=0.08, posed=at, at=at)
+    sender, live, bag = begin(parts, first=8)
+    (note,) = (note for note in live.notes if "do not undo" in note)
+    assert note.startswith(
+        "/points: times of points do not undo the lidar's motion: most poses are more than 0.2"
+    )
+    found = one_by_one(sender, live)
+    recorded = {frame.name: frame for frame in open_dataset(bag)}
+    assert len(recorded) == 8
+    assert len(found) == 8 - 4 + 1  # of those heard at first the newest
+    for ours in found:
+        np.testing.assert_array_equal(ours.points_m, recorded[ours.name].points_m)
+
+
 def test_each_image_has_the_camera_of_its_time(begin: Begin) -> None:
     other, small = PinholeCamera(16, 12, 21.0, 22.0, 7.5, 5.5), PinholeCamera(8, 6, 7.0, 7.5, 3.5, 2.5)
     cameras = [CAMERA, CAMERA, other, small, small]

@@ -290,7 +290,9 @@ def _poses(columns: Columns, trajectory: TimedPoses | None, gap: float) -> PoseA
     return lambda stamp: timed.at(stamp, largest_s)
 
 
-def _is_posed(columns: Columns, stamp: float, pose: Pose | None, trajectory: TimedPoses, gap: float) -> bool:
+def _is_posed(
+    columns: Columns, stamp: float, pose: Pose | None, trajectory: TimedPoses, gap: float
+) -> bool | None:
     """True if a ``trajectory`` goes from the first column of the scan at a ``stamp`` to the last."""
     at = _poses(columns, trajectory, gap)
     return pose is not None and Motion(stamp, pose, at).is_known(columns.stamps[columns.valid] - stamp)

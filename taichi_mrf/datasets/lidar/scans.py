@@ -79,11 +79,13 @@ class Motion:
         column = np.rint((seconds - first) / (last - first) * (_POSES_A_SCAN - 1)).astype(int)
         return T[column]
 
-    def is_known(self, seconds: NDArray[np.float64]) -> bool:
-        """True if poses are known from the first of the times (...) after the stamp in seconds to the last,
-        or all times are one. Times that are not finite do not count."""
+    def is_known(self, seconds: NDArray[np.float64]) -> bool | None:
+        """True if poses are known from the first of the times (...) after the stamp in seconds to the last;
+        None if all times are one. Times that are not finite do not count."""
         times = seconds[np.isfinite(seconds)]
-        return times.size == 0 or times.max() == times.min() or self._looked_up(times) is not None
+        if times.size == 0 or times.max() == times.min():
+            return None
+        return self._looked_up(times) is not None
 
     def _looked_up(self, seconds: NDArray[np.float64]) -> list[Pose] | None:
         """T_world_lidar at times that are spread from the first of ``seconds`` to the last, None if one of
@@ -282,6 +284,8 @@ class RecordedScan(Row):
 
 AnyScan = TypeVar("AnyScan")
 
+DENSER_POSES = "denser poses are needed, or a larger --max-time-gap"
+
 
 @dataclass
 class LidarScans(LidarRecording, Table[RecordedScan]):
@@ -331,15 +335,16 @@ def lidar_scans(
 
 
 def through_scans(
-    scans: Sequence[AnyScan], known: Sequence[bool], what: str, count: int, gap: float
+    scans: Sequence[AnyScan], known: Sequence[bool | None], what: str, count: int, gap: float
 ) -> tuple[list[AnyScan], list[str], str]:
-    """The scans of which poses are ``known`` from the first point to the last, with a note that counts the
-    others among ``count``. If there are none the motion during scans cannot be undone: all scans, and why.
-    ``gap`` is the largest time to a neighbouring pose in seconds, of which two lie between two poses."""
-    found = [scan for scan, is_known in zip(scans, known, strict=True) if is_known]
+    """The scans of which poses are ``known`` from the first point to the last, or that have no points with
+    times (None), with a note that counts the others among ``count``. If no poses are known the motion during
+    scans cannot be undone: all scans, and why. ``gap`` is the largest time to a neighbouring pose in seconds,
+    of which two lie between two poses."""
+    found = [scan for scan, is_known in zip(scans, known, strict=True) if is_known is None or is_known]
     poses = f"poses, at most {2 * gap:g} s apart, from its first point to its last"
-    if not found:
-        return list(scans), [], f"no scan has {poses}; denser poses are needed, or a larger --max-time-gap"
+    if not any(known) and len(found) < len(scans):
+        return list(scans), [], f"no scan has {poses}; {DENSER_POSES}"
     dropped = len(scans) - len(found)
     return found, [f"{dropped} of {count} {what} dropped: none has {poses}"] if dropped else [], ""
 

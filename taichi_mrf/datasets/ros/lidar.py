@@ -309,16 +309,17 @@ class Clouds:
             return entry.stamp
         return entry.stamp + (0.0 if seconds is None else max(0.0, float(np.nanmax(seconds))))
 
-    def is_posed(self, entry: Entry, message: Any, pose: Pose) -> bool:
-        """True if poses are known from a cloud's first point to its last, or are not asked for."""
+    def is_posed(self, entry: Entry, message: Any, pose: Pose) -> bool | None:
+        """True if poses are known from a cloud's first point to its last; None if they are not asked for, or
+        its points have no times that differ."""
         if self.at is None:
-            return True
+            return None
         try:
             cloud = decode(message, entry.stamp)
         except DatasetError:  # as above
-            return True
+            return None
         if cloud.seconds is None:
-            return True
+            return None
         motion = Motion(entry.stamp, pose, partial(self.at, entry.frame))
         return motion.is_known(cloud.seconds[measured_points(cloud.points_m)])
 

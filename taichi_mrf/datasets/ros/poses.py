@@ -94,6 +94,11 @@ class BagPoses:
         again = [each for each in self.moving if len(each) > 1] or self.moving
         return min((float(each.stamps.max(initial=-math.inf)) for each in again), default=math.inf)
 
+    def are_apart(self, largest_gap: float) -> bool:
+        """True if poses so far are mostly further apart in time than ``largest_gap`` seconds."""
+        moving = [each.stamps for each in self.moving if len(each) > 1 and not each.stands_still]
+        return any(float(np.median(np.diff(stamps))) > largest_gap for stamps in moving)
+
     def lacking(
         self, first: NDArray[np.float64], last: NDArray[np.float64], largest_gap: float
     ) -> NDArray[np.bool_]:

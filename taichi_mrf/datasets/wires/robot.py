@@ -21,7 +21,7 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.depth_scale import check_metres
 from taichi_mrf.datasets.entries import FOXGLOVE, ZENOH
-from taichi_mrf.datasets.lidar.scans import reach_of
+from taichi_mrf.datasets.lidar.scans import DENSER_POSES, reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.bag import (
@@ -262,8 +262,13 @@ def _turned(poses: dict[str, BagPoses]) -> dict[str, BagPoses]:
 def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
     sensor, poses, clouds = find_clouds(heard, chosen, options)
     parts = _parts(heard, sensor, poses, options)
-    first = _first_cloud(heard, sensor, poses, clouds, parts["gap"])
-    parts["notes"] += [clouds.in_words(first.camera)]
+    gap = parts["gap"]
+    if clouds.at is not None and any(each.are_apart(2 * gap) for each in poses.values()):
+        why = f"most poses are more than {2 * gap:g} s apart; {DENSER_POSES}"
+        parts["notes"].append(f"{clouds.topic}: times of points do not undo the lidar's motion: {why}")
+        clouds = replace(clouds, at=None)
+    first = _first_cloud(heard, sensor, poses, clouds, gap)
+    parts["notes"].append(clouds.in_words(first.camera))
     return LidarRobot(
         camera=first.camera,
         reach_m=reach_of(first.depth_m),

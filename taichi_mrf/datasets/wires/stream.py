@@ -95,9 +95,9 @@ class Robot(Dataset):
         """The time in seconds up to which poses are needed for a message."""
         return entry.stamp
 
-    def is_posed(self, heard: Heard, pose: Pose) -> bool:
-        """True if poses are known for all of a message that has one at its stamp."""
-        return True
+    def is_posed(self, heard: Heard, pose: Pose) -> bool | None:
+        """False if poses are not known for all of a message that has one at its stamp."""
+        return None
 
     def complete(self, posed: Posed) -> tuple[Posed, bool]:
         """A message with what belongs to it on other topics so far, and whether that has come."""
@@ -194,7 +194,7 @@ class Robot(Dataset):
             entry = image.heard.entry
             known = self.poses.get(entry.frame)
             pose = None if known is None or image.until_s > known.until else known.at(entry.stamp, self.gap)
-            if pose is None or not self.is_posed(image.heard, pose):
+            if pose is None or self.is_posed(image.heard, pose) is False:
                 self.dropped += 1
                 continue
             self.skipped += self._next is not None
@@ -350,8 +350,8 @@ class LidarRobot(Robot, LidarRecording):
         """When its last point was measured."""
         return self.clouds.until(entry, message)
 
-    def is_posed(self, heard: Heard, pose: Pose) -> bool:
-        """True if there are poses from its first point to its last."""
+    def is_posed(self, heard: Heard, pose: Pose) -> bool | None:
+        """False if poses are missing between its first point and its last."""
         return self.clouds.is_posed(heard.entry, heard.message, pose)
 
 
