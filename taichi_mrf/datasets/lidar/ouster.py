@@ -321,7 +321,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     beams = _beams(path, source, chosen.sensor)
     scans: list[NumberedRow] = []
     at: list[Pose | None] = []
-    through: list[bool] = []
+    through: list[bool | None] = []
     ends: list[Pose] = []
     reach_m = None
     for number in range(count):
