@@ -220,6 +220,10 @@ class Rules:
     whole_voxels_through: float = 0.03
     """That share for a camera in a map of which only voxels are left."""
 
+    whole_drift_m: float = 15.0
+    """Metres of a recording's path, from stretch to stretch, on which its own poses drift so little that the
+    others confirm where one was found."""
+
     whole_in_free: float = 0.08
     """Share of the images' points that may lie where the map is free, there: things that were moved, and a
     stereo camera's errors."""

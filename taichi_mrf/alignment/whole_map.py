@@ -4,7 +4,8 @@ A stretch of ten frames, by their own poses one scan, is tried at every place ne
 under every heading (wide_search). What fits best is aligned from coarse to fine, fewer poses at each level.
 A place counts only if the surface of the stretch lies on that of the map, its images do not look through
 what the map has there, hardly any of it lies where the map is free, its points determine all six directions,
-its colours are those of the map, if both have any, and no other place fits nearly as well.
+its colours are those of the map, if both have any, and no other place fits nearly as well. Other stretches
+of the recording then confirm it: in the mirror image of a room, a few views fit and the others do not.
 """
 
 from collections.abc import Callable, Sequence
@@ -132,6 +133,10 @@ class WholeMap:
         """Levels on which the best of them are."""
         return grids_of(self.surface, RULES.around_finest_m, RULES.whole_finest_m)[1:]
 
+    def may_look_through(self, stretch: "Stretch") -> float:
+        """The share of the walls that a stretch may look through."""
+        return RULES.whole_scan_through if stretch.around else self.most_through
+
     def in_free(self, points_m: NDArray[np.float64]) -> float:
         """The share of points (N, 3) around which all is free."""
         reach_m = max(RULES.whole_free_m, 2 * self.surface.cell_size)
@@ -193,9 +198,12 @@ class Stretch:
         T_recording_camera: Sequence[Pose],
         max_depth: float,
         colors: Sequence[NDArray[np.uint8] | None] = (),
+        names: tuple[str, ...] = (),
     ) -> None:
         """``images`` with their poses (4, 4) in the recording's world; points up to ``max_depth`` metres
-        count. ``colors`` (H, W, 3) are the images' own, if they have any."""
+        count. ``colors`` (H, W, 3) are the images' own, if they have any, and ``names`` those of
+        the frames."""
+        self.names = names
         self.T_recording_scan = T_recording_camera[len(images) // 2]
         T_scan_recording = inverse(self.T_recording_scan)
         self.T_scan_camera = [T_scan_recording @ T for T in T_recording_camera]
@@ -303,6 +311,31 @@ def locate_stretch(
     return _judged(stretch, whole, places) if places else LocatedRecording(None, "it fits nowhere")
 
 
+def confirmed(
+    found: LocatedRecording, number: int, stretches: Sequence[Stretch], whole: WholeMap
+) -> LocatedRecording:
+    """The place that was ``found`` of the stretch with this ``number``, or a refusal if the stretches of the
+    recording around it look through more of the map there than one may, in the mean. Each may be aligned
+    first, since the recording's own poses drift."""
+    T_map_recording = found.T_map_recording
+    if T_map_recording is None:
+        return found
+    places_m = np.array([stretch.T_recording_scan[:3, 3] for stretch in stretches])
+    path_m = np.cumsum([0.0, *np.linalg.norm(np.diff(places_m, axis=0), axis=1)])
+    near = np.flatnonzero(np.abs(path_m - path_m[number]) <= RULES.whole_drift_m)
+    shares, weights = [found.through], [found.overlap]
+    for other in (stretches[i] for i in near.tolist() if i != number):
+        there = locate_stretch(other, whole, T_map_recording)
+        as_recorded = other.looks_through(whole.walls, T_map_recording @ other.T_recording_scan)
+        shares.append(min(there.through, as_recorded))
+        weights.append(there.overlap)
+    through = float(np.average(shares, weights=weights))
+    if through <= whole.may_look_through(stretches[number]):
+        return found
+    reason = f"where a part fits best, the others would look through {through:.0%} of what is mapped"
+    return replace(found, T_map_recording=None, reason=f"another place: {reason}")
+
+
 def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
     up_map = upright(whole.planes.normals, whole.up)
     T_first = np.eye(4)
@@ -343,7 +376,7 @@ def _judged(stretch: Stretch, whole: WholeMap, places: Sequence[FoundPose]) -> L
         in_free=best.in_free,
         colors=colors[order[0]],
     )
-    most = RULES.whole_scan_through if stretch.around else whole.most_through
+    most = whole.may_look_through(stretch)
     reason = _objection(seen, best, most, RULES.whole_scan_in_free if stretch.around else RULES.whole_in_free)
     if reason:
         return replace(seen, reason=reason)

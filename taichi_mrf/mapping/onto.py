@@ -17,6 +17,7 @@ from taichi_mrf.alignment.whole_map import (
     LocatedRecording,
     Stretch,
     WholeMap,
+    confirmed,
     locate_stretch,
     map_of_voxels,
     walls_of,
@@ -101,12 +102,14 @@ def locate(
             f"not {m.METHOD.name}"
         )
     whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
-    for part in _stretches(m, frames, {} if kept is None else kept, tell):
-        images = [_image(m, frame) for frame in part]
-        poses, colors = [frame.T_world_camera for frame in part], [frame.color for frame in part]
-        stretch = Stretch(images, poses, m.sensor.max_depth, colors)
-        names = tuple(frame.name for frame in part)
-        now = replace(locate_stretch(stretch, whole, T_map_recording), frames=names)
+    parts = _stretches(m, frames, {} if kept is None else kept, tell)
+    stretches = (_stretch(m, part) for part in parts)
+    takes_long = isinstance(frames, Dataset) and (frames.endless or frames.tracked)
+    others = [] if takes_long else list(stretches)  # which confirm the one that is found
+    for number, stretch in enumerate(others or stretches):
+        now = replace(locate_stretch(stretch, whole, T_map_recording), frames=stretch.names)
+        if others:
+            now = confirmed(now, number, others, whole)
         if now.T_map_recording is not None:
             return now
         # Of several refusals the one counts that says most: two places that look alike, or the best fit.
@@ -143,9 +146,13 @@ def _stretches(
     return _posed(frames.read, len(frames), kept if frames.endless else None, tell)
 
 
-def _image(m: MRFMap, frame: Frame) -> DepthImage:
-    depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
-    return DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
+def _stretch(m: MRFMap, part: Sequence[Frame]) -> Stretch:
+    images = []
+    for frame in part:
+        depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
+        images.append(DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor)))
+    poses, colors = [frame.T_world_camera for frame in part], [frame.color for frame in part]
+    return Stretch(images, poses, m.sensor.max_depth, colors, tuple(frame.name for frame in part))
 
 
 STANDS_S = 10.0

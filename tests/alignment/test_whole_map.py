@@ -243,9 +243,10 @@ def test_walls_are_what_two_keyframes_have_measured() -> None:
 
 def test_a_recording_is_found_by_a_later_stretch_if_it_begins_elsewhere(yesterday: MRFMap) -> None:
     """The first frames are of another room, as if a door was passed."""
-    T = turned_away(3)
+    T, beside = turned_away(3), np.eye(4)
+    beside[0, 3] = 8.0
     elsewhere = [
-        Frame(f.depth_m, T @ f.T_world_camera, CAMERA, f.stamp, f"elsewhere {k}")
+        Frame(f.depth_m, T @ beside @ f.T_world_camera, CAMERA, f.stamp, f"elsewhere {k}")
         for k, f in enumerate(shot(box_room(5.0, 4.0), around(12)))
     ]
     here = [room_frames()[index] for index in TODAY]
@@ -253,4 +254,5 @@ def test_a_recording_is_found_by_a_later_stretch_if_it_begins_elsewhere(yesterda
     found = locate(yesterday, frames)
     assert found.T_map_recording is not None, found.reason
     assert tangent_norms(found.T_map_recording, inverse(T))[1] < 0.05
-    assert all(name.startswith("frame") for name in found.frames)
+    assert found.frames[-1].startswith("frame")
+    assert locate(yesterday, elsewhere).T_map_recording is None

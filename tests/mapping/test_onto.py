@@ -124,6 +124,28 @@ def test_todays_world_is_taken_to_the_maps(saved: Path) -> None:
     np.testing.assert_allclose(report["T_map_recording"], today.T_map_recording)
 
 
+def mirrored(dataset: Recorded) -> Recorded:
+    """A recording of the mirror image of what another shows: a flat on the other side of the stairs."""
+    M = np.diag([-1.0, 1.0, 1.0, 1.0])
+    frames = [
+        replace(frame, depth_m=frame.depth_m[:, ::-1].copy(), T_world_camera=M @ frame.T_world_camera @ M)
+        for frame in dataset.frames
+    ]
+    return replace(dataset, frames=frames)
+
+
+def test_a_mirror_image_of_which_some_views_fit_is_refused_by_the_others() -> None:
+    around = 120
+    m = map_sequence(recorded(range(0, around, 2), around=around), CONFIG).map
+    flat = mirrored(recorded(range(1, around, 2), turned_away(), around=around))
+    some = [locate(m, flat.frames[first : first + 10]) for first in range(0, 60, 10)]
+    assert any(found.T_map_recording is not None for found in some)
+    found = locate(m, flat)
+    assert found.T_map_recording is None
+    assert found.reason.startswith("another place: ")
+    assert locate(m, recorded(range(1, around, 2), turned_away(), around=around)).T_map_recording is not None
+
+
 def test_a_tracked_recording_is_found_by_its_own_small_map(saved: Path) -> None:
     m, T_today_room = tm.load_map(saved), turned_away(1)
     steps = range(2 * COUNT)
