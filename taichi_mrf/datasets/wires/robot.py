@@ -73,19 +73,11 @@ class ZenohChoice(SensorChoice):
     """The robot's ROS_DOMAIN_ID."""
 
 
-def open_foxglove(text: str, options: ReadOptions) -> Dataset:
-    """Connect to a robot: ``ADDRESS?option=value&...``. Raises DatasetError, which names the address, if it
-    cannot be reached, and as a bag does if it is not clear what to map."""
-    return _opened(f"{FOXGLOVE}{text}", options)
-
-
-def open_zenoh(text: str, options: ReadOptions) -> Dataset:
-    """The same over Zenoh, where the address may be missing."""
-    return _opened(f"{ZENOH}{text}", options)
-
-
-def _opened(source: str, options: ReadOptions) -> Dataset:
-    heard, chosen = _connected(source)
+def _opened(wire: str, text: str, options: ReadOptions) -> Dataset:
+    """Connect to a robot: ``ADDRESS?option=value&...``; over Zenoh the address may be missing. Raises
+    DatasetError, which names the address, if it cannot be reached, and as a bag does if it is not clear what
+    to map."""
+    heard, chosen = _connected(f"{wire}{text}")
     if options.track:
         chosen = replace(chosen, poses=TRACK)
     try:
@@ -95,6 +87,9 @@ def _opened(source: str, options: ReadOptions) -> Dataset:
         raise
     weakref.finalize(robot, heard.client.close)
     return robot
+
+
+open_foxglove, open_zenoh = partial(_opened, FOXGLOVE), partial(_opened, ZENOH)
 
 
 def summarise(source: str) -> BagSummary:
@@ -111,13 +106,11 @@ def _connected(source: str) -> tuple[HeardTopics, SensorChoice]:
     """A robot's topics, and what its options choose."""
     name, _, query = source.partition("?")
     address = name.partition(":")[2]
+    choice = parse_options(ZenohChoice if name.startswith(ZENOH) else SensorChoice, query, name)
     client: Client
-    choice: SensorChoice
-    if name.startswith(ZENOH):
-        choice = of_zenoh = parse_options(ZenohChoice, query, name)
-        client = ZenohClient(address, of_zenoh.domain)
+    if isinstance(choice, ZenohChoice):
+        client = ZenohClient(address, choice.domain)
     else:
-        choice = parse_options(SensorChoice, query, name)
         client = FoxgloveClient(address)
     try:
         return HeardTopics(client), choice
@@ -161,7 +154,7 @@ def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Rob
     robot = _decided(heard, chosen, options)
     kept = [robot.sensor.topic]
     kept += robot.topics if isinstance(robot, CameraRobot) else []
-    if chosen.poses != TRACK and not chosen.poses:
+    if not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
     heard.ask_for(kept)
     return robot
