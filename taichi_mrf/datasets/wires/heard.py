@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -51,10 +51,6 @@ class HeardTopics(TopicSource):
     def duration(self) -> float:  # type: ignore[override]
         """Seconds since the first topic was asked for."""
         return time.monotonic() - self._began
-
-    def ask_for(self, topics: Collection[str]) -> None:
-        """Hear these topics and no others."""
-        self.client.subscribe(topics)
 
     def hear(self) -> list[Heard]:
         """The messages that have come since the last call. One that cannot be decoded is left out, and

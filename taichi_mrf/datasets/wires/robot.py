@@ -24,13 +24,7 @@ from taichi_mrf.datasets.entries import FOXGLOVE, ZENOH
 from taichi_mrf.datasets.lidar.scans import DENSER_POSES, reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.bag import (
-    BagSummary,
-    by_body_axes,
-    may_be_body_axes,
-    summary_of,
-    turned_axes,
-)
+from taichi_mrf.datasets.ros.bag import BagSummary, by_axes, summary_of
 from taichi_mrf.datasets.ros.beside import (
     COLOR_GAP,
     Beside,
@@ -41,7 +35,7 @@ from taichi_mrf.datasets.ros.beside import (
 )
 from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
-from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
+from taichi_mrf.datasets.ros.sensor import BagSensor, SensorChoice, find_depth_camera
 from taichi_mrf.datasets.ros.sources import Topic
 from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.datasets.wires.client import Client
@@ -50,7 +44,6 @@ from taichi_mrf.datasets.wires.heard import NEEDED, HeardTopics
 from taichi_mrf.datasets.wires.rmw_zenoh import ZenohClient
 from taichi_mrf.datasets.wires.stream import CameraRobot, LidarRobot, Robot
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 
 LISTEN_S = 2.0
@@ -142,7 +135,7 @@ def _needed(heard: HeardTopics, chosen: SensorChoice, color: bool) -> list[str]:
 
 
 def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
-    heard.ask_for(topics)
+    heard.client.subscribe(topics)
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end:
         time.sleep(0.01)
@@ -156,7 +149,7 @@ def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Rob
     kept += robot.topics if isinstance(robot, CameraRobot) else []
     if not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
-    heard.ask_for(kept)
+    heard.client.subscribe(kept)
     return robot
 
 
@@ -182,7 +175,7 @@ def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions)
     if options.depth_scale is None:
         first = [heard.read(depth.name, entry) for entry in sensor.entries[:_LOOKED_AT]]
         check_metres(_readable(first), f"{heard.path}: topic {depth.name}")
-    poses, said = _by_axes(heard, mapped, chosen, options)
+    poses, said = by_axes(heard, mapped, chosen, options)
     stamps = [entry.stamp for entry in sensor.entries]
     of_depth = (depth, cameras.first, stamps, options.max_time_gap)
     if options.color:
@@ -222,34 +215,6 @@ def _readable(images: Iterable[Any]) -> list[NDArray[np.float32]]:
         with suppress(DatasetError):  # reported when its frame is read
             found.append(messages.depth_image(image, None))
     return found
-
-
-def _by_axes(
-    heard: HeardTopics, mapped: DepthCamera, chosen: SensorChoice, options: ReadOptions
-) -> tuple[dict[str, BagPoses], list[str]]:
-    """The poses of a camera's axes, turned with a note if what was heard so far shows a body's."""
-    depth, sensor, cameras, poses = mapped
-    if not may_be_body_axes(poses, chosen, options):
-        return poses, []
-    gap = largest_gap(options)
-    posed = [(entry, poses[entry.frame].at(entry.stamp, gap)) for entry in sensor.entries]
-    known = [(entry, T) for entry, T in posed if T is not None]
-
-    def metres(index: int) -> NDArray[np.float32]:
-        return messages.depth_image(heard.read(depth.name, known[index][0]), options.depth_scale)
-
-    said = by_body_axes([T for _, T in known], metres, cameras.first, depth.frame)
-    return (_turned(poses), [said]) if said else (poses, [])
-
-
-def _turned(poses: dict[str, BagPoses]) -> dict[str, BagPoses]:
-    """Poses of a body's axes as those of the camera's."""
-
-    def turned(of: BagPoses, stamp: float, gap: float) -> Pose | None:
-        T = of.at(stamp, gap)
-        return None if T is None else turned_axes(T)
-
-    return {frame: replace(each, at=partial(turned, each)) for frame, each in poses.items()}
 
 
 def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
