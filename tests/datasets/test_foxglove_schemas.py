@@ -1,5 +1,6 @@
 """Foxglove's own messages, as its library encodes them, read as those of ROS that say the same."""
 
+import sys
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -13,7 +14,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.client import wait_until
 from taichi_mrf.datasets.wires.schemas import protobuf_decoder
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, TaichiMRFError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
@@ -111,6 +112,12 @@ def test_a_damaged_message_is_an_error(cut: int) -> None:
     except DecodeError:
         return
     assert set(found) <= {"frame_id", "width", "height", "encoding", "step", "data"}
+
+
+def test_without_protobufs_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "google.protobuf.descriptor_pb2", None)
+    with pytest.raises(TaichiMRFError, match=r"need protobuf, .*: pip install 'taichi-mrf\[ros\]'"):
+        protobuf_decoder("foxglove.RawImage", m.RawImage.get_schema().data)
 
 
 def test_points_with_a_pose_of_their_own_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,14 +8,13 @@ by the same options. How messages become frames is in stream.py.
 
 import time
 import weakref
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.confidence import L515
@@ -173,8 +172,11 @@ def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions)
     depth, sensor, cameras, poses = mapped
     tracked, colors, imu = chosen.poses == TRACK, None, None
     if options.depth_scale is None:
-        first = [heard.read(depth.name, entry) for entry in sensor.entries[:_LOOKED_AT]]
-        check_metres(_readable(first), f"{heard.path}: topic {depth.name}")
+        depths = []
+        for entry in sensor.entries[:_LOOKED_AT]:
+            with suppress(DatasetError):  # reported when its frame is read
+                depths.append(messages.depth_image(heard.read(depth.name, entry), None))
+        check_metres(depths, f"{heard.path}: topic {depth.name}")
     poses, said = by_axes(heard, mapped, chosen, options)
     stamps = [entry.stamp for entry in sensor.entries]
     of_depth = (depth, cameras.first, stamps, options.max_time_gap)
@@ -206,15 +208,6 @@ def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions)
 def _without_counts(notes: list[str], beside: Beside | None) -> list[str]:
     """Notes of images that are used without how many of those that were heard so far have none."""
     return [each.partition(";")[0] if beside else each for each in notes]
-
-
-def _readable(images: Iterable[Any]) -> list[NDArray[np.float32]]:
-    """The numbers of the images that can be decoded."""
-    found = []
-    for image in images:
-        with suppress(DatasetError):  # reported when its frame is read
-            found.append(messages.depth_image(image, None))
-    return found
 
 
 def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:
