@@ -32,6 +32,9 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.system.libraries import library
 
+_TYPED = {CLOUD: "PointCloud", SURFACE: "SceneUpdate", PATH: "PosesInFrame", TRANSFORMS: "FrameTransforms"}
+"""Foxglove's own types by their topics."""
+
 
 def require_libraries(what: str) -> None:
     """Raise TaichiMRFError, which begins with ``what``, without the libraries that messages need."""
@@ -45,16 +48,12 @@ class MapChannels:
     def __init__(self, context: Any) -> None:
         """Raises TaichiMRFError without the libraries of the extra ``robot``."""
         foxglove = library("foxglove", "messages for robots need", "robot")
-        self._messages = library("foxglove.messages", "messages for robots need", "robot")
-        typed = library("foxglove.channels", "messages for robots need", "robot")
-        self._context = context  # channels end with it
-        self._voxels = typed.PointCloudChannel(CLOUD, context=context)
-        self._surface = typed.SceneUpdateChannel(SURFACE, context=context)
-        self._path = typed.PosesInFrameChannel(PATH, context=context)
-        self._transforms = typed.FrameTransformsChannel(TRANSFORMS, context=context)
-        typed_ones = self._voxels, self._surface, self._path, self._transforms
-        self._all = {each.topic(): each for each in typed_ones}
-        ros = RosMessages(lambda topic, content, time_ns: self._all[topic].log(content, log_time=time_ns))
+        self._messages, self._context = foxglove.messages, context  # channels end with their context
+        self._all = {
+            topic: getattr(foxglove.channels, f"{name}Channel")(topic, context=context)
+            for topic, name in _TYPED.items()
+        }
+        ros = RosMessages(self._log)
         for topic in (COSTMAP, OCTOMAP):
             schema = foxglove.Schema(
                 name=TYPES[topic], encoding="ros2msg", data=ros.definition(topic).encode()
@@ -72,16 +71,14 @@ class MapChannels:
             timestamp=self._time(stamp_s), parent_frame_id=WORLD, child_frame_id=CAMERA,
             translation=place, rotation=turn,
         )  # fmt: skip
-        message = self._messages.FrameTransforms(transforms=[transform])
-        self._transforms.log(message, log_time=nanoseconds(stamp_s))
+        self._log(TRANSFORMS, self._messages.FrameTransforms(transforms=[transform]), nanoseconds(stamp_s))
 
     def path(self, T_world_camera: Mapping[float, Pose]) -> None:
         newest_s = max(T_world_camera)
-        in_time = [T for _, T in sorted(T_world_camera.items(), key=lambda each: each[0])]
-        placed = [self._placed(T) for T in in_time]
+        placed = [self._placed(T_world_camera[stamp_s]) for stamp_s in sorted(T_world_camera)]
         poses = [self._messages.Pose(position=place, orientation=turn) for place, turn in placed]
         path = self._messages.PosesInFrame(timestamp=self._time(newest_s), frame_id=WORLD, poses=poses)
-        self._path.log(path, log_time=nanoseconds(newest_s))
+        self._log(PATH, path, nanoseconds(newest_s))
 
     def voxels(self, points: Points, stamp_s: float) -> None:
         records = point_records(points)
@@ -96,7 +93,7 @@ class MapChannels:
             timestamp=self._time(stamp_s), frame_id=WORLD, pose=self._messages.Pose(),
             point_stride=records.dtype.itemsize, fields=fields, data=records.tobytes(),
         )  # fmt: skip
-        self._voxels.log(cloud, log_time=nanoseconds(stamp_s))
+        self._log(CLOUD, cloud, nanoseconds(stamp_s))
 
     def surface(self, surface: Surface, stamp_s: float) -> None:
         make = self._messages
@@ -109,7 +106,10 @@ class MapChannels:
         entity = make.SceneEntity(
             timestamp=self._time(stamp_s), frame_id=WORLD, id="surface", triangles=[triangles]
         )
-        self._surface.log(make.SceneUpdate(entities=[entity]), log_time=nanoseconds(stamp_s))
+        self._log(SURFACE, make.SceneUpdate(entities=[entity]), nanoseconds(stamp_s))
+
+    def _log(self, topic: str, message: Any, time_ns: int) -> None:
+        self._all[topic].log(message, log_time=time_ns)
 
     def _placed(self, T: Pose) -> tuple[Any, Any]:
         """A pose as a Vector3 and a Quaternion."""

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 from taichi_mrf.config.arguments import ArgumentTypeError, shown
@@ -19,7 +18,7 @@ from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.export.formats import MESSAGES, MapToSend
 from taichi_mrf.export.map_sink import SURFACE, TRANSFORMS
 from taichi_mrf.export.options import ExportOptions
-from taichi_mrf.export.robot_messages import MapChannels, require_libraries
+from taichi_mrf.export.robot_messages import MapChannels
 from taichi_mrf.export.ros_messages import TYPES, RosMessages
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -158,9 +157,7 @@ class Published:
     def __enter__(self) -> "Published":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
 
@@ -190,7 +187,6 @@ class _Foxglove:
     """Foxglove's own server."""
 
     def __init__(self, came: Callable[[str], None], host: str, port: int) -> None:
-        require_libraries("messages for robots need")
         foxglove = library("foxglove", "messages for robots need", "robot")
         context = foxglove.Context()
         self.channels = MapChannels(context)

@@ -16,7 +16,7 @@ def library(name: str, who_needs: str, extra: str, error: type[TaichiMRFError] =
     try:
         return importlib.import_module(name)
     except ImportError as missing:
-        package = name.partition(".")[0]
+        package = name.removeprefix("google.").partition(".")[0]  # google is the beginning of many
         raise error(
             f"{who_needs} {package}, which is not installed: pip install 'taichi-mrf[{extra}]'"
         ) from missing

@@ -19,6 +19,7 @@ from taichi_mrf.errors import DatasetError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
+import foxglove as library
 from foxglove_robot import Robot, robot
 
 
@@ -86,6 +87,25 @@ def test_a_lost_connection_is_made_again_with_its_topics(
     walk.start()
     walk.wait_for("/odom")
     assert client.problem == ""
+    walk.send("/odom")
+    assert len(heard(client, 5)) == 5
+
+
+def test_a_topic_that_is_advertised_again_is_heard_again(walk: Robot, client: FoxgloveClient) -> None:
+    """A publisher that starts again has another number; without one the topic is not there."""
+    client.subscribe(["/odom"])
+    walk.wait_for("/odom")
+    old, known = walk.channels["/odom"], client.channels["/odom"]
+    old.close()
+    assert wait_until(lambda: "/odom" not in client.channels, SECONDS)
+    walk.listener.topics.clear()
+    schema = library.Schema(name=known.type, encoding="ros2msg", data=known.definition.encode())
+    walk.channels["/odom"] = library.Channel(
+        "/odom", schema=schema, message_encoding="cdr", context=walk.context
+    )
+    assert walk.channels["/odom"].id() != old.id()
+    walk.wait_for("/odom")
+    assert client.channels["/odom"] == known
     walk.send("/odom")
     assert len(heard(client, 5)) == 5
 

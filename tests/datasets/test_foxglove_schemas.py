@@ -1,5 +1,6 @@
 """Foxglove's own messages, as its library encodes them, read as those of ROS that say the same."""
 
+import sys
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -10,15 +11,16 @@ import pytest
 from inputs_bags import COUNT, FRAME, TOPIC, Bag, images, mounted, moving_tf, stamp, steps, write_bag
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.wires import protobuf
 from taichi_mrf.datasets.wires import robot as wired
 from taichi_mrf.datasets.wires.client import wait_until
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.datasets.wires.schemas import protobuf_decoder
+from taichi_mrf.errors import DatasetError, TaichiMRFError
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
 from foxglove import messages as m
 from foxglove_robot import Robot, robot
+from google.protobuf.message import DecodeError
 
 SECONDS = 20
 BETWEEN = np.arange(-0.5, COUNT).tolist()
@@ -94,8 +96,8 @@ def test_protobuf_is_decoded_by_its_descriptors() -> None:
     message = m.CameraCalibration(
         timestamp=m.Timestamp(1_700_000_000, 7), frame_id="eye", width=640, height=480, D=[], K=[1.5] * 9
     )
-    types = protobuf.types_of(m.CameraCalibration.get_schema().data)
-    found = protobuf.decode(message.encode(), "foxglove.CameraCalibration", types)
+    decode = protobuf_decoder("foxglove.CameraCalibration", m.CameraCalibration.get_schema().data)
+    found = decode(message.encode())
     assert found["timestamp"] == {"seconds": 1_700_000_000, "nanos": 7}
     assert (found["frame_id"], found["width"], found["K"]) == ("eye", 640, [1.5] * 9)
     assert "D" not in found
@@ -103,13 +105,19 @@ def test_protobuf_is_decoded_by_its_descriptors() -> None:
 
 @pytest.mark.parametrize("cut", range(1, 40))
 def test_a_damaged_message_is_an_error(cut: int) -> None:
-    types = protobuf.types_of(m.RawImage.get_schema().data)
+    decode = protobuf_decoder("foxglove.RawImage", m.RawImage.get_schema().data)
     data = m.RawImage(frame_id="camera", width=2, height=2, encoding="16UC1", step=4, data=bytes(8)).encode()
     try:
-        found = protobuf.decode(data[:-cut], "foxglove.RawImage", types)
-    except (ValueError, KeyError):
+        found = decode(data[:-cut])
+    except DecodeError:
         return
     assert set(found) <= {"frame_id", "width", "height", "encoding", "step", "data"}
+
+
+def test_without_protobufs_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "google.protobuf.descriptor_pb2", None)
+    with pytest.raises(TaichiMRFError, match=r"need protobuf, .*: pip install 'taichi-mrf\[ros\]'"):
+        protobuf_decoder("foxglove.RawImage", m.RawImage.get_schema().data)
 
 
 def test_points_with_a_pose_of_their_own_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,11 +15,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, StampedPoses, Table, start_pose
+from taichi_mrf.datasets.base import Dataset, Table, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
@@ -33,6 +34,7 @@ from taichi_mrf.datasets.ros.poses import BagPoses, pose_candidates
 from taichi_mrf.datasets.ros.reader import BagRow, RosReader
 from taichi_mrf.datasets.ros.sensor import (
     BagCameras,
+    DepthCamera,
     SensorChoice,
     find_depth_camera,
     posed_by,
@@ -40,12 +42,8 @@ from taichi_mrf.datasets.ros.sensor import (
 )
 from taichi_mrf.datasets.ros.sources import Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.tf import Transforms, TransformTree, read_transforms, tree_of
-from taichi_mrf.datasets.ros.topics import (
-    cloud_topics,
-    depth_topics,
-    message_frame,
-)
-from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.datasets.ros.topics import cloud_topics, depth_topics, message_frame
+from taichi_mrf.datasets.timed_poses import TimedPoses, largest_gap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -93,22 +91,6 @@ class RosBag(Table[BagRow]):
             check_metres(depths, f"{self.reader.path}: topic {self.topic}")
         return note_of_largest(shares)
 
-    def look_at_axes(self, frame: str) -> None:
-        """Take the poses for those of a body's axes, x ahead and z up, if neighbouring images agree clearly
-        better so: names such as camera_link are used for both."""
-        recorded = [self.pose(index) for index in range(len(self.rows))]
-        said = by_body_axes(recorded, self._metres, self.camera, frame)
-        if said:
-            turned = [turned_axes(T) for T in recorded]
-            self.rows = [replace(row, pose=T) for row, T in zip(self.rows, turned, strict=True)]
-            if self.track is not None:
-                self.track = partial(_turned, self.track)
-            self.notes.append(said)
-
-    def _metres(self, index: int) -> NDArray[np.float32]:
-        message = self.reader.read(self.topic, self.rows[index].entry)
-        return messages.depth_image(message, self.depth_scale)
-
     def load(self, index: int, row: BagRow, T_world_camera: Pose) -> Frame:
         """Decode one image, which must have its camera's size."""
         message = self.reader.read(self.topic, row.entry)
@@ -123,40 +105,48 @@ class RosBag(Table[BagRow]):
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
-def turned_axes(T: Pose) -> Pose:
-    """A pose of a body's axes, x ahead and z up, as that of the camera's."""
-    return pose_of(T, Conventions(axes="ros"))
-
-
-def may_be_body_axes(found: Mapping[str, BagPoses], chosen: SensorChoice, options: ReadOptions) -> bool:
-    """True if nothing says whether poses, by the frames of images, are of a camera's axes or a body's."""
-    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
+def by_axes(
+    reader: TopicSource, mapped: DepthCamera, chosen: SensorChoice, options: ReadOptions
+) -> tuple[dict[str, BagPoses], list[str]]:
+    """The poses of a camera's axes. If nothing says whether poses are of these or of a body's, x ahead and z
+    up, and neighbouring images agree clearly better so, they are turned, with a note: names such as
+    camera_link are used for both."""
+    depth, sensor, cameras, poses = mapped
+    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in poses.items())
     stated = chosen.poses == TRACK or chosen.optical or chosen.body or options.conventions.of_poses
-    return doubtful and not stated
+    if stated or not doubtful:
+        return poses, []
+    gap, turned = largest_gap(options), {frame: _turned(each) for frame, each in poses.items()}
+    known = [entry for entry in sensor.entries if poses[entry.frame].at(entry.stamp, gap) is not None]
 
+    def metres(index: int) -> NDArray[np.float32]:
+        return messages.depth_image(reader.read(depth.name, known[index]), options.depth_scale)
 
-def by_body_axes(
-    recorded: Sequence[Pose], metres: Callable[[int], NDArray[np.float32]], camera: PinholeCamera, frame: str
-) -> str:
-    """A note if the poses of images are clearly those of a body's axes: neighbouring images then agree much
-    better. ``metres`` reads an image. Empty if not."""
+    def placed(of: Mapping[str, BagPoses], index: int) -> Any:
+        return of[known[index].frame].at(known[index].stamp, gap)
+
     found = [
-        gather(len(poses), poses.__getitem__, metres, camera, (1.0,)).disagreement
-        for poses in (recorded, [turned_axes(T) for T in recorded])
+        gather(len(known), partial(placed, each), metres, cameras.first, (1.0,)).disagreement
+        for each in (poses, turned)
     ]
     if not all(found) or found[1][1.0] >= min(_AGREE, 0.5 * found[0][1.0]):
-        return ""
-    return (
-        f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
+        return poses, []
+    note = (
+        f"poses of {depth.frame or 'the camera'} are taken for those of a body, x ahead and z up: "
         f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
         "?body=FRAME or ?optical=FRAME takes them as they are"
     )
+    return turned, [note]
 
 
-def _turned(track: Callable[[], StampedPoses]) -> StampedPoses:
-    """The poses of a body's axes as those of the camera's."""
-    stamps, poses = track()
-    return stamps, [turned_axes(T) for T in poses]
+def _turned(poses: BagPoses) -> BagPoses:
+    """Poses of a body's axes, x ahead and z up, as those of the camera's."""
+
+    def at(stamp: float, gap: float) -> Pose | None:
+        T = poses.at(stamp, gap)
+        return None if T is None else pose_of(T, Conventions(axes="ros"))
+
+    return replace(poses, at=at)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -191,7 +181,8 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
 def _open(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> Dataset:
     if maps_clouds(reader, chosen):
         return _open_lidar(reader, chosen, options)
-    depth, sensor, cameras, found = find_depth_camera(reader, chosen, options)
+    depth, sensor, cameras, _ = mapped = find_depth_camera(reader, chosen, options)
+    found, by_turned = by_axes(reader, mapped, chosen, options)
     posed, notes = posed_by(sensor, found, options)
     dropped = len(sensor.entries) - len(posed)
     stamps, colors = [entry.stamp for _, entry, _ in posed], None
@@ -209,11 +200,11 @@ def _open(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> Data
             gyro, acceleration = imu.samples(imu.rows)
             T_start = start_pose(upwards_at(acceleration, stamps[0]))
             posed = [(i, entry, T_start) for i, entry, _ in posed]
-    bag = RosBag(
+    return RosBag(
         name=reader.path.stem,
         camera=cameras.first,
         cameras=cameras,
-        notes=notes,
+        notes=notes + by_turned,
         dropped=dropped,
         distortion=cameras.distortion,
         reader=reader,
@@ -228,9 +219,6 @@ def _open(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> Data
         gyro=gyro,
         acceleration=acceleration,
     )
-    if may_be_body_axes(found, chosen, options):
-        bag.look_at_axes(depth.frame)
-    return bag
 
 
 def _open_lidar(reader: RosReader, chosen: SensorChoice, options: ReadOptions) -> LidarBag:

@@ -49,9 +49,10 @@ class Beside:
         """Colours or sigmas of a depth image's pixels, None if it has none. Raises DatasetError, which names
         file and topic."""
         entry = self.entries[index]
-        if entry is None:
-            return None
-        message = self.reader.read(self.topic, entry)
+        return None if entry is None else self.of(self.reader.read(self.topic, entry), depth_m, camera)
+
+    def of(self, message: Any, depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[Any]:
+        """The same of a message of the topic."""
         with naming(f"{self.reader.path}: topic {self.topic}"):
             return self.decode(message, depth_m, camera)
 

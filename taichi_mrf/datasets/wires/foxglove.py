@@ -50,9 +50,8 @@ class FoxgloveClient(Client):
         whole = _whole(address)
         super().__init__(whole, f"foxglove:{whole}")
         self._wanted: set[str] = set()
-        self._subscribed: dict[int, Channel] = {}
-        self._numbers: dict[str, int] = {}
-        self._by_number: dict[int, str] = {}
+        self._subscribed: set[int] = set()  # a channel's number serves for its subscription, too
+        self._by_number: dict[int, Channel] = {}
         self._advertised, self._ended = threading.Event(), threading.Event()
         self._connection = self._connect()
         self._thread = threading.Thread(target=self._receive, name="foxglove", daemon=True)
@@ -66,15 +65,8 @@ class FoxgloveClient(Client):
 
     def subscribe(self, topics: Collection[str]) -> None:
         """Ask for the messages of these topics and of no others, also of those that are advertised later."""
-        with self._lock:
-            gone = [number for number, each in self._subscribed.items() if each.topic not in topics]
-            self._wanted = set(topics)
-            for number in gone:
-                del self._subscribed[number]
-            new = self._unsubscribed()
-        if gone:
-            self._send({"op": "unsubscribe", "subscriptionIds": gone})
-        self._send_subscribe(new)
+        self._wanted = set(topics)
+        self._ask()
 
     def close(self) -> None:
         """End the connection."""
@@ -149,45 +141,36 @@ class FoxgloveClient(Client):
             return  # the server's time, or an answer that was not asked for
         _, number, logged_ns = _MESSAGE.unpack_from(frame)
         with self._lock:
-            channel = self._subscribed.get(number)
-            if channel is not None:
-                self._keep(channel, logged_ns, frame[_MESSAGE.size :])
+            if number in self._subscribed:
+                self._keep(self._by_number[number], logged_ns, frame[_MESSAGE.size :])
 
     def _take_in_words(self, words: dict[str, Any]) -> None:
-        if words.get("op") == "advertise":
-            with self._lock:
-                for each in words["channels"]:
-                    channel = _channel(each)
-                    self.channels[channel.topic] = channel
-                    self._by_number[each["id"]] = channel.topic
-                    self._numbers[channel.topic] = each["id"]
-                new = self._unsubscribed()
-            if self.channels:
-                self._advertised.set()
-            self._send_subscribe(new)
-        elif words.get("op") == "unadvertise":
-            with self._lock:
+        with self._lock:
+            if words.get("op") == "advertise":
+                self._by_number |= {each["id"]: _channel(each) for each in words["channels"]}
+            elif words.get("op") == "unadvertise":
                 for number in words["channelIds"]:
-                    topic = self._by_number.pop(number, "")
-                    if self._numbers.get(topic) == number:
-                        self.channels.pop(topic, None)
-                        self._subscribed.pop(number, None)
+                    self._by_number.pop(number, None)
+                    self._subscribed.discard(number)
+            else:
+                return
+            self.channels = {each.topic: each for each in self._by_number.values()}
+        if self.channels:
+            self._advertised.set()
+        self._ask()
 
-    def _unsubscribed(self) -> list[int]:
-        """Note the wanted channels that are there as subscribed to, by their numbers, which serve for the
-        subscriptions, too; returns those that were not."""
-        new = [
-            self._numbers[topic]
-            for topic in sorted(self._wanted & set(self.channels))
-            if self._numbers[topic] not in self._subscribed
-        ]
-        self._subscribed |= {number: self.channels[self._by_number[number]] for number in new}
-        return new
-
-    def _send_subscribe(self, numbers: list[int]) -> None:
-        if numbers:
-            wanted = [{"id": number, "channelId": number} for number in numbers]
-            self._send({"op": "subscribe", "subscriptions": wanted})
+    def _ask(self) -> None:
+        """Subscribe to the wanted channels that are there, and to no others."""
+        with self._lock:
+            numbers = {each.topic: number for number, each in self._by_number.items()}
+            wanted = {number for topic, number in numbers.items() if topic in self._wanted}
+            new, gone = sorted(wanted - self._subscribed), sorted(self._subscribed - wanted)
+            self._subscribed = wanted
+        if gone:
+            self._send({"op": "unsubscribe", "subscriptionIds": gone})
+        if new:
+            pairs = [{"id": number, "channelId": number} for number in new]
+            self._send({"op": "subscribe", "subscriptions": pairs})
 
     def _send(self, words: dict[str, Any]) -> None:
         with suppress(ConnectionClosed):  # the thread connects again, and subscribes
@@ -196,19 +179,13 @@ class FoxgloveClient(Client):
 
 def _channel(words: dict[str, Any]) -> Channel:
     """A channel as it is advertised. Of those in protobuf or JSON Foxglove's own types are read."""
-    encoding, kind = str(words["encoding"]), str(words.get("schemaName", ""))
+    topic, encoding, kind = str(words["topic"]), str(words["encoding"]), str(words.get("schemaName", ""))
+    definition = str(words.get("schema", ""))
     if encoding in (PROTOBUF, JSON) and kind in ROS_TYPES:
-        return Channel(
-            str(words["topic"]), ROS_TYPES[kind], encoding, "NONE", str(words.get("schema", "")), kind
-        )
+        return Channel(topic, ROS_TYPES[kind], encoding, "NONE", definition, kind)
     language = str(words.get("schemaEncoding", "")) or {CDR: "ros2msg", ROS1: "ros1msg"}.get(encoding, "")
-    return Channel(
-        str(words["topic"]),
-        ros2_name(kind) if encoding == ROS1 else kind,
-        encoding,
-        LANGUAGES.get(language, "NONE"),
-        str(words.get("schema", "")),
-    )
+    type = ros2_name(kind) if encoding == ROS1 else kind
+    return Channel(topic, type, encoding, LANGUAGES.get(language, "NONE"), definition)
 
 
 def _another(why: str) -> str:

@@ -2,15 +2,16 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.decoding import Decoder
 from taichi_mrf.datasets.ros.sources import Channel, Entry, Topic, TopicSource, entry_of
 from taichi_mrf.datasets.wires.client import MOST_IMAGES, Client
-from taichi_mrf.datasets.wires.schemas import SchemaDecoder
+from taichi_mrf.datasets.wires.schemas import decoder_of
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.libraries import library
 
@@ -40,9 +41,8 @@ class HeardTopics(TopicSource):
         self.broken: Counter[str] = Counter()
         self.problem = ""
         self._decoder = Decoder()
-        self._own: dict[Channel, SchemaDecoder] = {}
+        self._decoders: dict[Channel, Callable[[bytes], Any]] = {}
         self._kept: dict[str, deque[Heard]] | None = {}
-        self._learnt: set[Channel] = set()
         self._last: dict[str, Entry] = {}
         self._began = time.monotonic()
         self._learn()
@@ -52,10 +52,6 @@ class HeardTopics(TopicSource):
         """Seconds since the first topic was asked for."""
         return time.monotonic() - self._began
 
-    def ask_for(self, topics: Collection[str]) -> None:
-        """Hear these topics and no others."""
-        self.client.subscribe(topics)
-
     def hear(self) -> list[Heard]:
         """The messages that have come since the last call. One that cannot be decoded is left out, and
         counted in ``broken``; ``problem`` says why."""
@@ -64,10 +60,7 @@ class HeardTopics(TopicSource):
         for raw in self.client.take():
             channel = raw.channel
             try:
-                if channel in self._own:
-                    message = self._own[channel].decode(raw.data)
-                else:
-                    message = self._decoder.decode(channel.type, channel.encoding, raw.data)
+                message = self._decoders[channel](raw.data)
             except Exception as error:  # the library raises many kinds of errors
                 self.broken[channel.topic] += 1
                 self.problem = f"{self.path}: topic {channel.topic}: cannot be read: {said(error)}"
@@ -105,17 +98,16 @@ class HeardTopics(TopicSource):
 
     def _learn(self) -> None:
         """Learn the types of channels that are new."""
-        new = [each for each in list(self.client.channels.values()) if each not in self._learnt]
+        new = [each for each in list(self.client.channels.values()) if each not in self._decoders]
         if not new:
             return
-        self._learnt |= set(new)
-        problems = dict(zip(new, self._decoder.learn(new), strict=True))
-        for channel in (each for each in new if each.schema):
+        for channel, problem in zip(new, self._decoder.learn(new), strict=True):
+            self._decoders[channel] = partial(self._decoder.decode, channel.type, channel.encoding)
             try:
-                self._own[channel], problems[channel] = SchemaDecoder(channel), ""
+                if channel.schema:
+                    self._decoders[channel], problem = decoder_of(channel), ""
             except Exception as error:  # descriptors may be anything
-                problems[channel] = said(error)
-        for channel, problem in problems.items():
+                problem = said(error)
             kind = f"{channel.type} ({problem})" if problem else channel.type
             known = self.topics.get(channel.topic)
             self.topics[channel.topic] = Topic(channel.topic, kind, known.messages if known else 0)

@@ -62,31 +62,94 @@ class Publisher(NamedTuple):
     described: str
 
 
-class ZenohClient(Client):
+class _Node:
+    """A node of a robot's ROS 2. ``source`` names where it is."""
+
+    def __init__(self, address: str, domain: int, problem: type[TaichiMRFError]) -> None:
+        """Connect to ``tcp/host:port``, a router or a node, of which the protocol and the port may be
+        missing; without an address to the router on this machine and to who answers by multicast.
+        ``domain`` is the robot's ROS_DOMAIN_ID. Raises ``problem``, which names the address, if nobody
+        answers there, and if Zenoh is not installed."""
+        self.address, self._domain, self._declared = _whole(address), domain, 0
+        self.source = f"zenoh:{self.address}" + (f"?domain={domain}" if domain else "")
+        if domain < 0:
+            raise problem(f"{self.source}: a domain is a number from 0 on")
+        self._zenoh = library("zenoh", f"{self.source} needs", "robot", problem)
+        self._ext = library("zenoh.ext", f"{self.source} needs", "robot", problem)
+        self._session = self._opened(problem)
+
+    def _opened(self, problem: type[TaichiMRFError]) -> Any:
+        """A session. With an address it is a client, for whom a router sends on what all publish; without one
+        a peer as the robot's own nodes are, which opens no port to the network."""
+        address, is_peer = self.address or f"tcp/localhost:{PORT}", not self.address
+        settings: dict[str, Any] = {
+            "mode": "peer" if is_peer else "client",
+            "connect/endpoints": [address],
+            "connect/timeout_ms": 0 if is_peer else round(CONNECT_S * 1000),
+            "connect/exit_on_failure": not is_peer,
+            "scouting/multicast/enabled": is_peer,
+            "timestamping/enabled": True,  # which kept messages need
+            **({"listen/endpoints": ["tcp/localhost:0"]} if is_peer else {}),
+        }
+        config = self._zenoh.Config()
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+        except self._zenoh.ZError as error:
+            raise problem(
+                f"{self.source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}"
+            ) from error
+        try:
+            return self._zenoh.open(config)
+        except self._zenoh.ZError as error:
+            why = said(error).partition(" at /")[0]  # without where in Zenoh's source
+            raise problem(
+                f"{self.source}: no answer within {CONNECT_S:g} s: is the robot on, in this network, its "
+                f"port open? '{ROUTER}' starts its router, on port {PORT} (Zenoh: {why})"
+            ) from error
+
+    def _declare(self, entity: str, described: str = "") -> Any:
+        """A liveliness token: first that of the node (NN), then of its publishers or subscribers of a topic,
+        which is ``described`` by the end of the token."""
+        numbers = str(self._domain), str(self._session.info.zid()), "0", str(self._declared)
+        self._declared += 1
+        token = "/".join([_TOKEN, *numbers, entity, _NODE, described]).rstrip("/")
+        return self._session.liveliness().declare_token(token)
+
+    def _watch(self, entity: str, take_in: Callable[[str, Publisher, bool], None]) -> None:
+        """Call ``take_in`` with each token of an ``entity`` that comes or goes, what it says, and whether it
+        has come; also with those that are there."""
+
+        def take_in_token(sample: Any) -> None:
+            token = str(sample.key_expr)
+            found = publisher_of(token, entity)
+            if found is not None:
+                take_in(token, found, sample.kind == self._zenoh.SampleKind.PUT)
+
+        every = f"{_TOKEN}/{self._domain}/**"
+        self._session.liveliness().declare_subscriber(every, take_in_token, history=True)
+
+    def close(self) -> None:
+        """End the connection."""
+        with suppress(self._zenoh.ZError):
+            self._session.close()
+
+
+class ZenohClient(_Node, Client):
     """Listens to the publishers of a domain. ``channels`` are those that were heard of."""
 
     def __init__(self, address: str, domain: int = 0) -> None:
-        """Connect to ``tcp/host:port``, a router or a node, of which the protocol and the port may be
-        missing; without an address to the router on this machine and to who answers by multicast. ``domain``
-        is the robot's ROS_DOMAIN_ID. Raises DatasetError, which names the address, if nobody answers there or
+        """Connect as a node does. Raises DatasetError, which names the address, if nobody answers there or
         nobody publishes, and if Zenoh is not installed."""
-        whole = _whole(address)
-        super().__init__(whole, f"zenoh:{whole}" + (f"?domain={domain}" if domain else ""))
-        if domain < 0:
-            raise DatasetError(f"{self.source}: a domain is a number from 0 on")
-        self._domain, self._declared = domain, 0
-        self._zenoh = library("zenoh", f"{self.source} needs", "robot", DatasetError)
-        self._ext = library("zenoh.ext", f"{self.source} needs", "robot", DatasetError)
+        _Node.__init__(self, address, domain, DatasetError)
+        Client.__init__(self, self.address, self.source)
         self._publishers: dict[str, Publisher] = {}
         self._subscribed: dict[str, list[Any]] = {}
-        self._session = _opened(self._zenoh, whole, self.source, DatasetError)
         try:
-            self._session.liveliness().declare_subscriber(
-                f"{_TOKEN}/{domain}/**", self._take_in_token, history=True
-            )
+            self._watch(_PUBLISHER, self._take_in_token)
             if not wait_until(lambda: bool(self.channels), FIND_S):
                 raise DatasetError(f"{self.source}: {self._nobody()}")
-            self._node = _declared(self._session, domain, 0, "NN")
+            self._node = self._declare("NN")
         except BaseException:
             self.close()
             raise
@@ -95,6 +158,7 @@ class ZenohClient(Client):
     def subscribe(self, topics: Collection[str]) -> None:
         """Ask for the messages of these topics and of no others; those that a transient local publisher keeps
         come, too, also if it comes later."""
+        session, ext = self._session, self._ext
         for topic in set(self._subscribed) - set(topics):
             for each in self._subscribed.pop(topic):
                 each.undeclare()
@@ -104,26 +168,18 @@ class ZenohClient(Client):
             publisher = publishers.get(topic)
             key = f"{self._domain}/{topic.strip('/')}/*/*"  # whatever its type, and the hash of that
             if publisher is not None and publisher.transient_local:
-                subscriber = self._ext.declare_advanced_subscriber(
-                    self._session,
+                subscriber = ext.declare_advanced_subscriber(
+                    session,
                     key,
                     self._take_in,
-                    history=self._ext.HistoryConfig(detect_late_publishers=True),
-                    recovery=self._ext.RecoveryConfig(heartbeat=True),
+                    history=ext.HistoryConfig(detect_late_publishers=True),
+                    recovery=ext.RecoveryConfig(heartbeat=True),
                 )
             else:
-                subscriber = self._session.declare_subscriber(key, self._take_in)
+                subscriber = session.declare_subscriber(key, self._take_in)
             self._subscribed[topic] = [subscriber]
             if publisher is not None:  # nodes that publish only while somebody listens look for such a token
-                self._declared += 1
-                self._subscribed[topic].append(
-                    _declared(self._session, self._domain, self._declared, _SUBSCRIBER, publisher.described)
-                )
-
-    def close(self) -> None:
-        """End the connection."""
-        with suppress(self._zenoh.ZError):
-            self._session.close()
+                self._subscribed[topic].append(self._declare(_SUBSCRIBER, publisher.described))
 
     def _nobody(self) -> str:
         """Why there are no topics."""
@@ -142,13 +198,9 @@ class ZenohClient(Client):
             + ", and its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp" * (not hint)
         )
 
-    def _take_in_token(self, sample: Any) -> None:
-        token = str(sample.key_expr)
-        publisher = publisher_of(token)
-        if publisher is None:
-            return
+    def _take_in_token(self, token: str, publisher: Publisher, has_come: bool) -> None:
         with self._lock:
-            if sample.kind == self._zenoh.SampleKind.PUT:
+            if has_come:
                 self._publishers[token] = publisher
             else:
                 self._publishers.pop(token, None)
@@ -169,27 +221,23 @@ class ZenohClient(Client):
                 )
 
 
-class ZenohNode:
-    """A node that publishes, and keeps each topic's last message for who comes later. ``source`` names it."""
+class ZenohNode(_Node):
+    """A node that publishes, and keeps each topic's last message for who comes later."""
 
     def __init__(
         self, address: str, domain: int, types: Mapping[str, tuple[str, str]], came: Callable[[str], None]
     ) -> None:
-        """Connect as ZenohClient does, and publish on the topics of ``types``: name (nav_msgs/msg/Path) and
+        """Connect as a node does, and publish on the topics of ``types``: name (nav_msgs/msg/Path) and
         hash of each one's type. ``came`` is told, from another thread, of each topic that somebody has
         subscribed to. Raises ConfigError, which names the address, if nobody answers there, and if Zenoh is
         not installed."""
-        whole = _whole(address)
-        self.source = f"zenoh:{whole}" + (f"?domain={domain}" if domain else "")
-        self._zenoh = library("zenoh", f"{self.source} needs", "robot", ConfigError)
-        ext = library("zenoh.ext", f"{self.source} needs", "robot", ConfigError)
-        self._session = _opened(self._zenoh, whole, self.source, ConfigError)
-        self._topics, self._came = set(types), came
+        super().__init__(address, domain, ConfigError)
+        ext, self._came = self._ext, came
         self._listeners: dict[str, str] = {}
-        self._sent, self._publishers, self._tokens = Counter[str](), dict[str, Any](), []
+        self._sent, self._publishers = Counter[str](), dict[str, Any]()
         self._gids = {topic: uuid.uuid4().bytes for topic in types}
-        self._tokens.append(_declared(self._session, domain, 0, "NN"))
-        for number, (topic, (name, type_hash)) in enumerate(types.items(), 1):
+        self._tokens = [self._declare("NN")]
+        for topic, (name, type_hash) in types.items():
             kind = _dds_type(name)
             self._publishers[topic] = ext.declare_advanced_publisher(
                 self._session,
@@ -200,10 +248,8 @@ class ZenohNode:
                 congestion_control=self._zenoh.CongestionControl.BLOCK,  # a cloud is many packets
             )
             described = f"{topic.replace('/', '%')}/{kind}/{type_hash}/{_KEPT_QOS}"
-            self._tokens.append(_declared(self._session, domain, number, _PUBLISHER, described))
-        self._session.liveliness().declare_subscriber(
-            f"{_TOKEN}/{domain}/**", self._take_in_token, history=True
-        )
+            self._tokens.append(self._declare(_PUBLISHER, described))
+        self._watch(_SUBSCRIBER, self._take_in_token)
 
     def send(self, topic: str, content: bytes) -> None:
         """Publish a message, in CDR with its encapsulation."""
@@ -215,62 +261,13 @@ class ZenohNode:
         """True if somebody has subscribed to the topic."""
         return topic in list(self._listeners.values())
 
-    def close(self) -> None:
-        """End the connection."""
-        with suppress(self._zenoh.ZError):
-            self._session.close()
-
-    def _take_in_token(self, sample: Any) -> None:
-        token = str(sample.key_expr)
-        listener = publisher_of(token, _SUBSCRIBER)
-        if listener is None or listener.channel.topic not in self._topics:
-            return
-        if sample.kind == self._zenoh.SampleKind.PUT:
-            self._listeners[token] = listener.channel.topic
-            self._came(listener.channel.topic)
-        else:
+    def _take_in_token(self, token: str, listener: Publisher, has_come: bool) -> None:
+        topic = listener.channel.topic
+        if not has_come:
             self._listeners.pop(token, None)
-
-
-def _opened(zenoh: Any, address: str, source: str, problem: type[TaichiMRFError]) -> Any:
-    """A session. With an address it is a client, for whom a router sends on what all publish; without one a
-    peer as the robot's own nodes are, which opens no port to the network. Raises ``problem``."""
-    settings: dict[str, Any] = {
-        "mode": "client",
-        "connect/endpoints": [address],
-        "connect/timeout_ms": round(CONNECT_S * 1000),
-        "connect/exit_on_failure": True,
-        "scouting/multicast/enabled": False,
-    }
-    if not address:
-        settings = {
-            "mode": "peer",
-            "connect/endpoints": [f"tcp/localhost:{PORT}"],
-            "connect/timeout_ms": 0,
-            "connect/exit_on_failure": False,
-            "listen/endpoints": ["tcp/localhost:0"],
-            "scouting/multicast/enabled": True,
-        }
-    config = zenoh.Config()
-    try:
-        for name, value in {**settings, "timestamping/enabled": True}.items():  # which kept messages need
-            config.insert_json5(name, json.dumps(value))
-    except zenoh.ZError as error:
-        raise problem(f"{source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}") from error
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise problem(
-            f"{source}: no answer within {CONNECT_S:g} s: is the robot on, in this network, its "
-            f"port open? '{ROUTER}' starts its router, on port {PORT} (Zenoh: {_first(error)})"
-        ) from error
-
-
-def _declared(session: Any, domain: int, number: int, entity: str, described: str = "") -> Any:
-    """The liveliness token of the node (NN), or of its publisher or subscriber of a topic that is
-    ``described`` by the end of the token."""
-    parts = [_TOKEN, str(domain), str(session.info.zid()), "0", str(number), entity, _NODE, described]
-    return session.liveliness().declare_token("/".join(parts).rstrip("/"))
+        elif topic in self._publishers:
+            self._listeners[token] = topic
+            self._came(topic)
 
 
 def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
@@ -302,11 +299,6 @@ def _dds_type(name: str) -> str:
     """The inverse of :func:`_ros_type`."""
     package, between, name = name.split("/")
     return f"{package}::{between}::dds_::{name}_"
-
-
-def _first(error: Exception) -> str:
-    """What an error of Zenoh's says, without where in its source."""
-    return said(error).partition(" at /")[0]
 
 
 def _whole(address: str) -> str:

@@ -8,14 +8,13 @@ by the same options. How messages become frames is in stream.py.
 
 import time
 import weakref
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.confidence import L515
@@ -24,13 +23,7 @@ from taichi_mrf.datasets.entries import FOXGLOVE, ZENOH
 from taichi_mrf.datasets.lidar.scans import DENSER_POSES, reach_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.bag import (
-    BagSummary,
-    by_body_axes,
-    may_be_body_axes,
-    summary_of,
-    turned_axes,
-)
+from taichi_mrf.datasets.ros.bag import BagSummary, by_axes, summary_of
 from taichi_mrf.datasets.ros.beside import (
     COLOR_GAP,
     Beside,
@@ -41,7 +34,7 @@ from taichi_mrf.datasets.ros.beside import (
 )
 from taichi_mrf.datasets.ros.lidar import Clouds, find_clouds, maps_clouds
 from taichi_mrf.datasets.ros.poses import BagPoses
-from taichi_mrf.datasets.ros.sensor import BagSensor, DepthCamera, SensorChoice, find_depth_camera
+from taichi_mrf.datasets.ros.sensor import BagSensor, SensorChoice, find_depth_camera
 from taichi_mrf.datasets.ros.sources import Topic
 from taichi_mrf.datasets.timed_poses import largest_gap
 from taichi_mrf.datasets.wires.client import Client
@@ -50,7 +43,6 @@ from taichi_mrf.datasets.wires.heard import NEEDED, HeardTopics
 from taichi_mrf.datasets.wires.rmw_zenoh import ZenohClient
 from taichi_mrf.datasets.wires.stream import CameraRobot, LidarRobot, Robot
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 
 LISTEN_S = 2.0
@@ -73,19 +65,11 @@ class ZenohChoice(SensorChoice):
     """The robot's ROS_DOMAIN_ID."""
 
 
-def open_foxglove(text: str, options: ReadOptions) -> Dataset:
-    """Connect to a robot: ``ADDRESS?option=value&...``. Raises DatasetError, which names the address, if it
-    cannot be reached, and as a bag does if it is not clear what to map."""
-    return _opened(f"{FOXGLOVE}{text}", options)
-
-
-def open_zenoh(text: str, options: ReadOptions) -> Dataset:
-    """The same over Zenoh, where the address may be missing."""
-    return _opened(f"{ZENOH}{text}", options)
-
-
-def _opened(source: str, options: ReadOptions) -> Dataset:
-    heard, chosen = _connected(source)
+def _opened(wire: str, text: str, options: ReadOptions) -> Dataset:
+    """Connect to a robot: ``ADDRESS?option=value&...``; over Zenoh the address may be missing. Raises
+    DatasetError, which names the address, if it cannot be reached, and as a bag does if it is not clear what
+    to map."""
+    heard, chosen = _connected(f"{wire}{text}")
     if options.track:
         chosen = replace(chosen, poses=TRACK)
     try:
@@ -95,6 +79,9 @@ def _opened(source: str, options: ReadOptions) -> Dataset:
         raise
     weakref.finalize(robot, heard.client.close)
     return robot
+
+
+open_foxglove, open_zenoh = partial(_opened, FOXGLOVE), partial(_opened, ZENOH)
 
 
 def summarise(source: str) -> BagSummary:
@@ -111,13 +98,11 @@ def _connected(source: str) -> tuple[HeardTopics, SensorChoice]:
     """A robot's topics, and what its options choose."""
     name, _, query = source.partition("?")
     address = name.partition(":")[2]
+    choice = parse_options(ZenohChoice if name.startswith(ZENOH) else SensorChoice, query, name)
     client: Client
-    choice: SensorChoice
-    if name.startswith(ZENOH):
-        choice = of_zenoh = parse_options(ZenohChoice, query, name)
-        client = ZenohClient(address, of_zenoh.domain)
+    if isinstance(choice, ZenohChoice):
+        client = ZenohClient(address, choice.domain)
     else:
-        choice = parse_options(SensorChoice, query, name)
         client = FoxgloveClient(address)
     try:
         return HeardTopics(client), choice
@@ -149,7 +134,7 @@ def _needed(heard: HeardTopics, chosen: SensorChoice, color: bool) -> list[str]:
 
 
 def _listen(heard: HeardTopics, topics: Collection[str]) -> None:
-    heard.ask_for(topics)
+    heard.client.subscribe(topics)
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end:
         time.sleep(0.01)
@@ -161,9 +146,9 @@ def _open(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Rob
     robot = _decided(heard, chosen, options)
     kept = [robot.sensor.topic]
     kept += robot.topics if isinstance(robot, CameraRobot) else []
-    if chosen.poses != TRACK and not chosen.poses:
+    if not chosen.poses:
         kept += [t.name for t in heard.topics.values() if t.type in (*messages.TF, *messages.POSES)]
-    heard.ask_for(kept)
+    heard.client.subscribe(kept)
     return robot
 
 
@@ -187,9 +172,12 @@ def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions)
     depth, sensor, cameras, poses = mapped
     tracked, colors, imu = chosen.poses == TRACK, None, None
     if options.depth_scale is None:
-        first = [heard.read(depth.name, entry) for entry in sensor.entries[:_LOOKED_AT]]
-        check_metres(_readable(first), f"{heard.path}: topic {depth.name}")
-    poses, said = _by_axes(heard, mapped, chosen, options)
+        depths = []
+        for entry in sensor.entries[:_LOOKED_AT]:
+            with suppress(DatasetError):  # reported when its frame is read
+                depths.append(messages.depth_image(heard.read(depth.name, entry), None))
+        check_metres(depths, f"{heard.path}: topic {depth.name}")
+    poses, said = by_axes(heard, mapped, chosen, options)
     stamps = [entry.stamp for entry in sensor.entries]
     of_depth = (depth, cameras.first, stamps, options.max_time_gap)
     if options.color:
@@ -220,43 +208,6 @@ def _with_camera(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions)
 def _without_counts(notes: list[str], beside: Beside | None) -> list[str]:
     """Notes of images that are used without how many of those that were heard so far have none."""
     return [each.partition(";")[0] if beside else each for each in notes]
-
-
-def _readable(images: Iterable[Any]) -> list[NDArray[np.float32]]:
-    """The numbers of the images that can be decoded."""
-    found = []
-    for image in images:
-        with suppress(DatasetError):  # reported when its frame is read
-            found.append(messages.depth_image(image, None))
-    return found
-
-
-def _by_axes(
-    heard: HeardTopics, mapped: DepthCamera, chosen: SensorChoice, options: ReadOptions
-) -> tuple[dict[str, BagPoses], list[str]]:
-    """The poses of a camera's axes, turned with a note if what was heard so far shows a body's."""
-    depth, sensor, cameras, poses = mapped
-    if not may_be_body_axes(poses, chosen, options):
-        return poses, []
-    gap = largest_gap(options)
-    posed = [(entry, poses[entry.frame].at(entry.stamp, gap)) for entry in sensor.entries]
-    known = [(entry, T) for entry, T in posed if T is not None]
-
-    def metres(index: int) -> NDArray[np.float32]:
-        return messages.depth_image(heard.read(depth.name, known[index][0]), options.depth_scale)
-
-    said = by_body_axes([T for _, T in known], metres, cameras.first, depth.frame)
-    return (_turned(poses), [said]) if said else (poses, [])
-
-
-def _turned(poses: dict[str, BagPoses]) -> dict[str, BagPoses]:
-    """Poses of a body's axes as those of the camera's."""
-
-    def turned(of: BagPoses, stamp: float, gap: float) -> Pose | None:
-        T = of.at(stamp, gap)
-        return None if T is None else turned_axes(T)
-
-    return {frame: replace(each, at=partial(turned, each)) for frame, each in poses.items()}
 
 
 def _with_lidar(heard: HeardTopics, chosen: SensorChoice, options: ReadOptions) -> Robot:

@@ -6,7 +6,7 @@ then decided and decoded as for any robot: a RawImage is an Image, a FrameTransf
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,75 +14,94 @@ import numpy as np
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.sources import Channel
-from taichi_mrf.datasets.wires import protobuf
+from taichi_mrf.system.libraries import library
 
 PROTOBUF, JSON = "protobuf", "json"
 
-ROS_TYPES = {
-    "foxglove.RawImage": messages.IMAGE,
-    "foxglove.CompressedImage": messages.IMAGES[1],
-    "foxglove.CameraCalibration": messages.CAMERA_INFO,
-    "foxglove.FrameTransform": messages.TF[0],
-    "foxglove.FrameTransforms": messages.TF[0],
-    "foxglove.PointCloud": messages.POINT_CLOUD,
-    "foxglove.PoseInFrame": messages.POSE_STAMPED,
-}
+Said = Mapping[str, Any]
+"""The fields of a message by their names; those that were not sent have their default."""
 
 _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 """PointField's numbers of types, by those of PackedElementField."""
 
 
-class SchemaDecoder:
-    """Decodes the messages of a channel of one of ROS_TYPES."""
-
-    def __init__(self, channel: Channel) -> None:
-        """Raises errors of many kinds if the channel's descriptors are damaged."""
-        self._name, self._is_json = channel.schema, channel.encoding == JSON
-        self._types = {} if self._is_json else protobuf.types_of(base64.b64decode(channel.definition))
-        if not self._is_json and self._name not in self._types:
-            raise ValueError(f"its schema does not describe {self._name}")
-
-    def decode(self, data: bytes) -> Any:
-        """A message of ROS. Raises errors of many kinds for damaged data."""
-        said = json.loads(data) if self._is_json else protobuf.decode(data, self._name, self._types)
-        kind = ROS_TYPES[self._name]
-        if kind == messages.TF[0]:
-            return SimpleNamespace(transforms=[_transform(each) for each in said.get("transforms", [said])])
-        if kind == messages.POSE_STAMPED:
-            return SimpleNamespace(header=_header(said), pose=_pose(said.get("pose", {})))
-        if kind == messages.CAMERA_INFO:
-            return _camera(said)
-        data_bytes = said.get("data", b"")
-        data_bytes = base64.b64decode(data_bytes) if isinstance(data_bytes, str) else data_bytes
-        pixels = np.frombuffer(data_bytes, np.uint8)
-        if kind == messages.POINT_CLOUD:
-            return _cloud(said, pixels)
-        if kind == messages.IMAGE:
-            sizes = {name: int(said.get(name, 0)) for name in ("width", "height", "step")}
-            encoding = said.get("encoding", "")
-            return SimpleNamespace(
-                header=_header(said), encoding=encoding, is_bigendian=0, data=pixels, **sizes
-            )
-        return SimpleNamespace(header=_header(said), format=said.get("format", ""), data=pixels)
+def decoder_of(channel: Channel) -> Callable[[bytes], Any]:
+    """What makes messages of ROS of a channel's bytes, of one of ROS_TYPES; it raises errors of many kinds
+    for damaged data. Raises errors of many kinds if the channel's descriptors are damaged, and TaichiMRFError
+    without protobuf's library."""
+    made = _MADE[channel.schema][1]
+    if channel.encoding == JSON:
+        return lambda data: made(json.loads(data))
+    said = protobuf_decoder(channel.schema, base64.b64decode(channel.definition))
+    return lambda data: made(said(data))
 
 
-def _header(said: Mapping[str, Any], frame: str = "frame_id") -> SimpleNamespace:
+def protobuf_decoder(name: str, descriptors: bytes) -> Callable[[bytes], dict[str, Any]]:
+    """What finds the fields that were sent in the bytes of a message, whose type is ``name`` in a
+    FileDescriptorSet. It raises errors of many kinds for damaged data, and so does this for damaged
+    descriptors; ValueError if the type is not among them."""
+    need = "messages in protobuf need", "ros"
+    files = library("google.protobuf.descriptor_pb2", *need).FileDescriptorSet.FromString(descriptors).file
+    types = library("google.protobuf.message_factory", *need).GetMessages(files)
+    if name not in types:
+        raise ValueError(f"its schema does not describe {name}")
+    return lambda data: _sent(types[name].FromString(data))
+
+
+def _sent(message: Any) -> dict[str, Any]:
+    """The fields of a message of protobuf's library that were sent."""
+    return {
+        field.name: _plain(value) if field.message_type else value for field, value in message.ListFields()
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A field that is a message, or a list of them."""
+    return _sent(value) if hasattr(value, "ListFields") else [_sent(each) for each in value]
+
+
+def _header(said: Said, frame: str = "frame_id") -> SimpleNamespace:
     time = said.get("timestamp", {})
     sec, nanosec = (time.get("seconds", time.get("sec", 0)), time.get("nanos", time.get("nsec", 0)))
     stamp = SimpleNamespace(sec=int(sec), nanosec=int(nanosec))
     return SimpleNamespace(stamp=stamp, frame_id=said.get(frame, ""))
 
 
-def _numbers(said: Mapping[str, Any], names: str) -> SimpleNamespace:
+def _numbers(said: Said, names: str) -> SimpleNamespace:
     return SimpleNamespace(**{name: float(said.get(name, 0.0)) for name in names})
 
 
-def _pose(said: Mapping[str, Any]) -> SimpleNamespace:
+def _data(said: Said) -> Any:
+    """The bytes (N,) uint8 of a message, which are base64 in JSON."""
+    data = said.get("data", b"")
+    return np.frombuffer(base64.b64decode(data) if isinstance(data, str) else data, np.uint8)
+
+
+def _image(said: Said) -> SimpleNamespace:
+    sizes = {name: int(said.get(name, 0)) for name in ("width", "height", "step")}
+    encoding = said.get("encoding", "")
+    return SimpleNamespace(header=_header(said), encoding=encoding, is_bigendian=0, data=_data(said), **sizes)
+
+
+def _compressed(said: Said) -> SimpleNamespace:
+    return SimpleNamespace(header=_header(said), format=said.get("format", ""), data=_data(said))
+
+
+def _posed(said: Said) -> SimpleNamespace:
+    return SimpleNamespace(header=_header(said), pose=_pose(said.get("pose", {})))
+
+
+def _pose(said: Said) -> SimpleNamespace:
     position, orientation = said.get("position", {}), said.get("orientation", {})
     return SimpleNamespace(position=_numbers(position, "xyz"), orientation=_numbers(orientation, "xyzw"))
 
 
-def _transform(said: Mapping[str, Any]) -> SimpleNamespace:
+def _transforms(said: Said) -> SimpleNamespace:
+    """Those of FrameTransforms, or the one that a FrameTransform is."""
+    return SimpleNamespace(transforms=[_transform(each) for each in said.get("transforms", [said])])
+
+
+def _transform(said: Said) -> SimpleNamespace:
     return SimpleNamespace(
         header=_header(said, "parent_frame_id"),
         child_frame_id=said.get("child_frame_id", ""),
@@ -93,7 +112,7 @@ def _transform(said: Mapping[str, Any]) -> SimpleNamespace:
     )
 
 
-def _camera(said: Mapping[str, Any]) -> SimpleNamespace:
+def _camera(said: Said) -> SimpleNamespace:
     arrays = {"d": said.get("D", []), "k": said.get("K", [0.0] * 9), "p": said.get("P") or [0.0] * 12}
     return SimpleNamespace(
         header=_header(said),
@@ -107,11 +126,10 @@ def _camera(said: Mapping[str, Any]) -> SimpleNamespace:
     )
 
 
-def _cloud(said: Mapping[str, Any], data: Any) -> SimpleNamespace:
+def _cloud(said: Said) -> SimpleNamespace:
     """A row of points. Raises ValueError if they have a pose of their own in their frame."""
-    pose, step = _pose(said.get("pose", {})), int(said.get("point_stride", 0))
-    turn = (pose.orientation.x, pose.orientation.y, pose.orientation.z)
-    if any((pose.position.x, pose.position.y, pose.position.z, *turn)):
+    pose, data, step = said.get("pose", {}), _data(said), int(said.get("point_stride", 0))
+    if any(pose.get(part, {}).get(axis, 0.0) for part in ("position", "orientation") for axis in "xyz"):
         raise ValueError("its points have a pose in their frame: send them in the sensor's own frame")
     fields = [
         SimpleNamespace(
@@ -124,3 +142,17 @@ def _cloud(said: Mapping[str, Any], data: Any) -> SimpleNamespace:
     width = len(data) // step if step else 0
     sizes = {"height": 1, "width": width, "point_step": step, "row_step": width * step, "is_bigendian": False}
     return SimpleNamespace(header=_header(said), fields=fields, data=data, **sizes)
+
+
+_MADE: dict[str, tuple[str, Callable[[Said], Any]]] = {
+    "foxglove.RawImage": (messages.IMAGE, _image),
+    "foxglove.CompressedImage": (messages.IMAGES[1], _compressed),
+    "foxglove.CameraCalibration": (messages.CAMERA_INFO, _camera),
+    "foxglove.FrameTransform": (messages.TF[0], _transforms),
+    "foxglove.FrameTransforms": (messages.TF[0], _transforms),
+    "foxglove.PointCloud": (messages.POINT_CLOUD, _cloud),
+    "foxglove.PoseInFrame": (messages.POSE_STAMPED, _posed),
+}
+"""The type of ROS that says the same, and what makes one of the fields."""
+
+ROS_TYPES = {name: type for name, (type, _) in _MADE.items()}

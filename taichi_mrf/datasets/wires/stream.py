@@ -13,9 +13,6 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from taichi_mrf.datasets.base import Arrivals, Dataset, EndlessNames, start_pose
 from taichi_mrf.datasets.lidar.scans import LidarRecording
 from taichi_mrf.datasets.ros.beside import COLOR_GAP, BagImu, Beside, imu_row
@@ -26,9 +23,8 @@ from taichi_mrf.datasets.ros.sources import Entry
 from taichi_mrf.datasets.trajectories import RESTART_S
 from taichi_mrf.datasets.wires.client import MOST_IMAGES, wait_until
 from taichi_mrf.datasets.wires.heard import Heard, HeardTopics
-from taichi_mrf.errors import DatasetError, FrameError, naming
+from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.motion import MOST_SAMPLES, upwards_at
 
@@ -279,8 +275,12 @@ class CameraRobot(Robot):
         gyro = acceleration = None
         where = f"{self.heard.path}: topic {self.sensor.topic}"
         depth_m, camera = self.mapped.cameras.measured(message, entry, self.depth_scale, where)
-        color = self._decoded(self.colors, posed, depth_m, camera)
-        sigma_m = self._decoded(self.confidences, posed, depth_m, camera)
+        color, sigma_m = (
+            each.of(posed.beside[each.topic], depth_m, camera)
+            if each and each.topic in posed.beside
+            else None
+            for each in (self.colors, self.confidences)
+        )
         if self.imu is not None:
             gyro, acceleration = self.imu.samples(self._measured, posed.later_s)
             T_world_camera = start_pose(upwards_at(acceleration, stamp))
@@ -323,16 +323,6 @@ class CameraRobot(Robot):
         for topic, heard in self._beside.items():
             self._beside[topic] = deque([e for e in heard if e.entry.stamp <= stamp], MOST_IMAGES)
         self.mapped.cameras.begin_again()
-
-    def _decoded(
-        self, beside: Beside | None, posed: Posed, depth_m: NDArray[np.float32], camera: PinholeCamera
-    ) -> NDArray[Any] | None:
-        """Colours or sigmas of a depth image's pixels, None without. Raises DatasetError, which names source
-        and topic."""
-        if beside is None or beside.topic not in posed.beside:
-            return None
-        with naming(f"{self.heard.path}: topic {beside.topic}"):
-            return beside.decode(posed.beside[beside.topic], depth_m, camera)
 
 
 @dataclass
