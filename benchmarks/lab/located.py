@@ -2,13 +2,14 @@
 
 Recordings are cut in two: one part makes the map, ten frames of the other, turned and moved at random, are
 searched for in it, and where they are found is compared with where they were taken. Recordings of other
-places must be refused: each is searched for from another frame on, as `map --onto` does, in up to six
-stretches. Held-out frames judge what is mapped in a place that was found.
+places, and mirror images of recordings, must be refused: each is searched for from another frame on, as
+`map --onto` does, in up to six stretches, which confirm each other; so are whole second parts. Held-out
+frames judge what is mapped in a place that was found.
 """
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import permutations
 from pathlib import Path
@@ -23,17 +24,18 @@ from taichi_mrf.alignment.whole_map import LocatedRecording
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import overridden
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.evaluation.held_out import pooled_depth_error, surface_depth
 from taichi_mrf.evaluation.tables import Entry, Table, as_csv, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.geometry.poses import tangent_norms
+from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.onto import Placed, locate, placed_in, whole_map
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
@@ -59,6 +61,11 @@ ROOMS = {
     "corridor": "synthetic:corridor?frames=240&width=160&height=120",
     "coffin scene": "coffin_world",
 }
+UNSEEN_HALVES = {"house", "room", "street by stereo"}
+"""Their second halves show little that the first ones do."""
+
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
 COPIES = {"room", "corridor"}
 """The corridor's rooms are the room, each without one piece of its furniture and with another table."""
 
@@ -143,6 +150,34 @@ def moved_away(dataset: Dataset, seed: Sequence[int]) -> Placed:
     )
 
 
+class Mirrored(Derived):
+    """The mirror image of a recording by a camera."""
+
+    @staticmethod
+    def of(dataset: Dataset) -> "Mirrored":
+        """Left and right are exchanged."""
+        return Mirrored(dataset.name, _mirrored(dataset.camera), source=dataset)
+
+    def pose(self, index: int) -> Pose:
+        """The source's, in the mirror."""
+        return MIRROR @ self.source.pose(index) @ MIRROR
+
+    def read(self, index: int) -> Frame:
+        """The source's frame, in the mirror. Raises what the source raises."""
+        frame = self.source.read(index)
+        return replace(
+            frame,
+            depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1]),
+            T_world_camera=MIRROR @ frame.T_world_camera @ MIRROR,
+            camera=_mirrored(frame.camera),
+        )
+
+
+def _mirrored(camera: Camera) -> PinholeCamera:
+    assert isinstance(camera, PinholeCamera)
+    return replace(camera, cx=camera.width - 1 - camera.cx)
+
+
 def points_of(frame: Frame, max_depth: float) -> NDArray[np.float64]:
     """Some thousands of a frame's points (N, 3) in the world."""
     depth_m = np.asarray(frame.depth_m, np.float64).ravel()
@@ -155,7 +190,11 @@ def points_of(frame: Frame, max_depth: float) -> NDArray[np.float64]:
 def run_located(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """Where recordings are found, which are refused, and maps of two days beside those of one run."""
     (voxel_size,) = experiment.voxel_sizes
-    tries = (*_same_places(experiment, voxel_size), *_other_places(experiment, voxel_size))
+    tries = (
+        *_same_places(experiment, voxel_size),
+        *_whole_recordings(experiment, voxel_size),
+        *_other_places(experiment, voxel_size),
+    )
     columns = [
         "recording", "tries", *GRADES, "worst cm", "worst degrees", "sigma cm", "error^2 / sigma^2",
         "seconds", "at most", "MB",
@@ -206,6 +245,31 @@ def _same_places(experiment: Experiment, voxel_size: float) -> Tries:
                 (here if shown["share"] > OVERLAP else elsewhere).append(result)
             yield f"{name}, {part}", here
             yield f"{name}, another part", elsewhere
+
+
+def _whole_recordings(experiment: Experiment, voxel_size: float) -> Tries:
+    """Second parts of recordings, and mirror images of them, from several frames on."""
+    whole: list[Result] = []
+    mirrored: list[Result] = []
+    for name, place, factor, _ in HALVES:
+        source, size = _source(experiment, place), factor * voxel_size
+        dataset = open_dataset(source)
+        count = len(dataset)
+        parts = {"second half": range(count // 2), "every second frame": range(0, count, 2)}
+        for part, mapped in parts.items():
+            yesterday = Yesterday(source, size, mapped)
+            rest = [index for index in range(count) if index not in mapped]
+            for i, first in enumerate((0, len(rest) // 4, len(rest) // 2)[: experiment.limit]):
+                today = chosen(dataset, rest[first:])
+                key = f"{place} | {size:g} m | {part} | whole | {first}"
+                work = partial(yesterday.search, today, (experiment.seeds[0], i))
+                if name not in UNSEEN_HALVES or part == "every second frame":
+                    whole.append(experiment.ledger.result(key, work))
+                if isinstance(dataset.camera, PinholeCamera):
+                    work = partial(yesterday.search, Mirrored.of(today), (experiment.seeds[0], i))
+                    mirrored.append(experiment.ledger.result(f"{key} | mirrored", work))
+    yield "whole second parts", whole
+    yield "mirror images of these", mirrored
 
 
 def _other_places(experiment: Experiment, voxel_size: float) -> Tries:
