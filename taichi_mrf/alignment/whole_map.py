@@ -8,6 +8,7 @@ its colours are those of the map, if both have any, and no other place fits near
 of the recording then confirm it: in the mirror image of a room, a few views fit and the others do not.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -133,7 +134,7 @@ class WholeMap:
         """Levels on which the best of them are."""
         return grids_of(self.surface, RULES.around_finest_m, RULES.whole_finest_m)[1:]
 
-    def may_look_through(self, stretch: "Stretch") -> float:
+    def may_look_through(self, stretch: "Scan") -> float:
         """The share of the walls that a stretch may look through."""
         return RULES.whole_scan_through if stretch.around else self.most_through
 
@@ -189,37 +190,23 @@ def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
     return surface.chosen(rows[some]).planes()
 
 
-class Stretch:
-    """Some frames of a recording as one scan, in the frame of the middle one's camera."""
+class Scan(ABC):
+    """Points that are searched for in a whole map as if one sensor had seen them all: in the frame of a pose
+    ``T_recording_scan`` (4, 4) of their own world, in which ``up`` (3,) points up to 45 degrees."""
+
+    views = RULES.whole_fewest
+    """Images that the points are from."""
+
+    around = False
+    """True if the sensor sees around."""
 
     def __init__(
-        self,
-        images: Sequence[DepthImage],
-        T_recording_camera: Sequence[Pose],
-        max_depth: float,
-        colors: Sequence[NDArray[np.uint8] | None] = (),
-        names: tuple[str, ...] = (),
-    ) -> None:
-        """``images`` with their poses (4, 4) in the recording's world; points up to ``max_depth`` metres
-        count. ``colors`` (H, W, 3) are the images' own, if they have any, and ``names`` those of
-        the frames."""
-        self.names = names
-        self.T_recording_scan = T_recording_camera[len(images) // 2]
-        T_scan_recording = inverse(self.T_recording_scan)
-        self.T_scan_camera = [T_scan_recording @ T for T in T_recording_camera]
-        self.images = images
-        ups = [T[:3, :3] @ image.camera.up for image, T in zip(images, self.T_scan_camera, strict=True)]
-        self.up = np.mean(ups, axis=0)
-        of_each = RULES.whole_points // len(images)
-        parts = [oriented_points(image, max_depth).about(of_each) for image in images]
-        self.points = _one_scan(parts, self.T_scan_camera)
-        self._brightness: NDArray[np.float64] | None = None
-        if colors and all(color is not None for color in colors):
-            pairs = zip(parts, colors, strict=True)
-            seen = [color[tuple(STRIDE * part.places.T[::-1])] for part, color in pairs if color is not None]
-            self._brightness = _brightness(np.concatenate(seen))
-        self.around = sees_around(images[0].camera)
-        self._sights = [Sightlines.of(image) for image in images] if self.around else []
+        self, T_recording_scan: Pose, points: OrientedPoints, up: NDArray[np.float64],
+        colors: NDArray[np.uint8] | None = None,
+    ) -> None:  # fmt: skip
+        """``colors`` (N, 3) are those of the points, 0 0 0 where they are not known."""
+        self.T_recording_scan, self.points, self.up = T_recording_scan, points, up
+        self._brightness = None if colors is None else _brightness(colors)
 
     @cached_property
     def lever_m(self) -> float:
@@ -243,8 +230,45 @@ class Stretch:
         spread = float(seen.std() * mapped.std())  # none where all is of one brightness
         return float(np.cov(seen, mapped, bias=True)[0, 1]) / spread if spread > 0 else float("nan")
 
+    @abstractmethod
     def looks_through(self, surface: Planes, T_map_scan: Pose) -> float:
-        """The share of a mapped surface that the images look through from a pose (4, 4), in the mean."""
+        """The share of a mapped surface that cannot be there if the scan was taken at a pose (4, 4)."""
+
+
+class Stretch(Scan):
+    """Some frames of a recording as one scan, in the frame of the middle one's camera."""
+
+    def __init__(
+        self,
+        images: Sequence[DepthImage],
+        T_recording_camera: Sequence[Pose],
+        max_depth: float,
+        colors: Sequence[NDArray[np.uint8] | None] = (),
+        names: tuple[str, ...] = (),
+    ) -> None:
+        """``images`` with their poses (4, 4) in the recording's world; points up to ``max_depth`` metres
+        count. ``colors`` (H, W, 3) are the images' own, if they have any, and ``names`` those of the
+        frames."""
+        self.names = names
+        T_recording_scan = T_recording_camera[len(images) // 2]
+        T_scan_recording = inverse(T_recording_scan)
+        self.T_scan_camera = [T_scan_recording @ T for T in T_recording_camera]
+        self.images, self.views = images, len(images)
+        ups = [T[:3, :3] @ image.camera.up for image, T in zip(images, self.T_scan_camera, strict=True)]
+        of_each = RULES.whole_points // len(images)
+        parts = [oriented_points(image, max_depth).about(of_each) for image in images]
+        seen = None
+        if colors and all(color is not None for color in colors):
+            pairs = zip(parts, colors, strict=True)
+            seen = np.concatenate(
+                [c[tuple(STRIDE * part.places.T[::-1])] for part, c in pairs if c is not None]
+            )
+        super().__init__(T_recording_scan, _one_scan(parts, self.T_scan_camera), np.mean(ups, axis=0), seen)
+        self.around = sees_around(images[0].camera)
+        self._sights = [Sightlines.of(image) for image in images] if self.around else []
+
+    def looks_through(self, surface: Planes, T_map_scan: Pose) -> float:
+        """The share of it that the images look through, in the mean."""
         poses = [T_map_scan @ T for T in self.T_scan_camera]
         if self._sights:
             shares = [sight.seen_through(surface, T) for sight, T in zip(self._sights, poses, strict=True)]
@@ -273,12 +297,10 @@ def _one_scan(parts: Sequence[OrientedPoints], poses: Sequence[Pose]) -> Oriente
     )
 
 
-def locate_stretch(
-    stretch: Stretch, whole: WholeMap, T_map_recording: Pose | None = None
-) -> LocatedRecording:
+def locate_stretch(stretch: Scan, whole: WholeMap, T_map_recording: Pose | None = None) -> LocatedRecording:
     """The place of a stretch in a whole map, or a refusal. If it is thought to be at ``T_map_recording``
     (4, 4), it is looked for only near there."""
-    points, views = stretch.points, len(stretch.images)
+    points, views = stretch.points, stretch.views
     if views < RULES.whole_fewest:
         return LocatedRecording(None, f"too little seen: {views} views, and {RULES.whole_fewest} are needed")
     if len(points.points) < LEAST_POINTS or len(whole.planes.points_m) < LEAST_POINTS:
@@ -312,7 +334,7 @@ def locate_stretch(
 
 
 def confirmed(
-    found: LocatedRecording, number: int, stretches: Sequence[Stretch], whole: WholeMap
+    found: LocatedRecording, number: int, stretches: Sequence[Scan], whole: WholeMap
 ) -> LocatedRecording:
     """The place that was ``found`` of the stretch with this ``number``, or a refusal if the stretches of the
     recording around it look through more of the map there than one may, in the mean. Each may be aligned
@@ -336,7 +358,7 @@ def confirmed(
     return replace(found, T_map_recording=None, reason=f"another place: {reason}")
 
 
-def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
+def _candidates(stretch: Scan, whole: WholeMap) -> list[Pose]:
     up_map = upright(whole.planes.normals, whole.up)
     T_first = np.eye(4)
     # An upright scan amid the cameras: any heading will do.
@@ -360,7 +382,7 @@ def _candidates(stretch: Stretch, whole: WholeMap) -> list[Pose]:
     return best_poses(stretch.points, whole.planes, T_first, up_map, near_cameras, number)
 
 
-def _judged(stretch: Stretch, whole: WholeMap, places: Sequence[FoundPose]) -> LocatedRecording:
+def _judged(stretch: Scan, whole: WholeMap, places: Sequence[FoundPose]) -> LocatedRecording:
     """Verdict on the best of several places, whose worth colours raise."""
     colors = [stretch.alike(whole, place.end.T_world_camera) for place in places]
     gains = RULES.whole_color_worth * np.nan_to_num(colors)

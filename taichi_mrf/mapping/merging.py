@@ -2,7 +2,8 @@
 
 The first map stays where it is. A map that is not found in it may be found in another that was. Keyframes of
 two maps that see the same are aligned with each other, as where a loop is closed (loops.py), and the graph of
-these steps and of those within each map moves the keyframes of the later maps a little.
+these steps and of those within each map moves the keyframes of the later maps a little. What frozen keyframes
+have left is moved to where its map was found, as evidence.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,21 +11,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from taichi_mrf.alignment.map_scan import scans_of
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.pairs import fit_to
 from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.seen_through import looked_through
-from taichi_mrf.alignment.whole_map import LocatedRecording
+from taichi_mrf.alignment.whole_map import LocatedRecording, confirmed, locate_stretch
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.mapping.loops import FREE
-from taichi_mrf.mapping.onto import free_prefix, locate
+from taichi_mrf.mapping.onto import free_prefix, locate, whole_map
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.moved_evidence import check
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 
@@ -51,10 +54,10 @@ class _Node:
 
 
 def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
-    """Merge maps of one place into the first, which may have frozen keyframes. ``names`` are for messages.
+    """Merge maps of one place into the first. ``names`` are for messages.
 
     Raises ConfigError for fewer than two maps, for one whose keyframes cannot be aligned, for a later one
-    whose keyframes are frozen, and DatasetError for one that is found in no other.
+    whose frozen evidence cannot be moved (MRFMap.take_in), and DatasetError for one that is in no other.
     """
     called = list(names) or [f"map {number}" for number in range(1, len(maps) + 1)]
     parts = _checked(maps, called)
@@ -80,8 +83,11 @@ def merge(maps: Sequence[OccupancyMap], names: Sequence[str] = ()) -> Merged:
         for n, node in enumerate(nodes):
             if node.number == number > 0:
                 _add(m, part, node.keyframe, as_pose(solution.poses[n]), prefix)
+        if number > 0 and part.frozen:
+            m.take_in(part, T_first_map[number])
     m.infer()
-    moved_m = max(tangent_norms(placed[n], solution.poses[n])[1] for n in range(len(nodes)))
+    moved = (tangent_norms(placed[n], solution.poses[n])[1] for n in range(len(nodes)))
+    moved_m = max(moved, default=0.0)
     return Merged(m, tuple(located), int((trust > RULES.trusted).sum()), moved_m)
 
 
@@ -113,10 +119,7 @@ def _checked(maps: Sequence[OccupancyMap], names: Sequence[str]) -> list[MRFMap]
             needed = methods_with("can_refine_poses")
             raise ConfigError(f"{name}: maps of the method {needed} can be merged, not {m.METHOD.name}")
         if m.frozen and parts:
-            raise ConfigError(
-                f"{name}: frozen keyframes stay where they are: pass it as the first map, or map its "
-                "recording onto that"
-            )
+            check(parts[0].config, m.config, m.window, name)
         parts.append(m)
     return parts
 
@@ -140,13 +143,27 @@ def _located(parts: Sequence[MRFMap], names: Sequence[str]) -> list[LocatedRecor
             if number in known:
                 continue
             asked.add((number, other))
-            found = locate(parts[other], [frame_of(each) for each in parts[number].keyframes.values()])
+            found = _found(parts[number], parts[other])
             if found.T_map_recording is None:
                 reasons.setdefault(number, found.reason)
             else:
                 T = _known(known[other]) @ found.T_map_recording
                 known[number] = replace(found, T_map_recording=T)
     return [known[number] for number in range(1, len(parts))]
+
+
+def _found(m: MRFMap, other: MRFMap) -> LocatedRecording:
+    """Where a map lies in another: by its keyframes, or, if any are frozen, by its voxels."""
+    if not m.frozen:
+        return locate(other, [frame_of(keyframe) for keyframe in m.keyframes.values()])
+    whole, refused = whole_map(other), LocatedRecording(None, "too little seen: it has no free space")
+    scans = list(scans_of(m, whole_map(m)))
+    for number, scan in enumerate(scans):
+        found = confirmed(locate_stretch(scan, whole), number, scans, whole)
+        if found.T_map_recording is not None:
+            return found
+        refused = refused if number else found
+    return refused
 
 
 def frame_of(keyframe: Keyframe) -> Frame:

@@ -1,12 +1,16 @@
 """Maps of one room that were made in worlds of their own become one map."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from two_days import CONFIG, COUNT, TODAY, YESTERDAY, recorded, turned_away
 
 import taichi_mrf as tm
+from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.synthetic.room import SPOTS
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
@@ -17,6 +21,7 @@ from taichi_mrf.mapping.onto import freeze_all, locate
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.moved_evidence import MOST
 from taichi_mrf.queries.change import compare_maps
 from taichi_mrf.queries.changed_things import things_between
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -111,8 +116,13 @@ def test_maps_that_cannot_be_merged_are_named() -> None:
     with pytest.raises(DatasetError, match=r"^b: not found in any other map: "):
         merge([a, elsewhere], ["a", "b"])
     a.freeze_keyframe(next(iter(a.keyframes)))
-    with pytest.raises(ConfigError, match=r"^b: frozen keyframes stay where they are"):
-        merge([elsewhere, a], ["a", "b"])
+    with pytest.raises(ConfigError, match=r"^b: has voxels of 0\.08 m, and the first map of 0\.1 m: "):
+        merge([MRFMap(0.1), a], ["a", "b"])
+    dated = MRFMap(CONFIG.voxel_size, time=TimeConfig(half_life_s=10.0))
+    with pytest.raises(ConfigError, match=r"^b: frozen evidence cannot be moved where time\.half_life_s"):
+        merge([dated, a], ["a", "b"])
+    with pytest.raises(ConfigError, match=r"^the other map: has voxels of 0\.08 m"):
+        MRFMap(0.1).take_in(a, np.eye(4))
 
 
 def test_a_map_whose_keyframes_are_frozen_takes_in_another() -> None:
@@ -129,6 +139,111 @@ def test_a_map_whose_keyframes_are_frozen_takes_in_another() -> None:
         assert shifted_m < 0.08
         assert np.degrees(turned_rad) < 2
     assert (a.state(centres) == tm.OCCUPIED).mean() > 0.9
+
+
+def frozen(indices: range, T_world_room: Pose | None = None, name: str = "frame") -> MRFMap:
+    m = made(indices, T_world_room, name)
+    freeze_all(m)
+    m.infer()
+    return m
+
+
+def test_maps_of_which_only_voxels_are_left_become_one(tmp_path: Path) -> None:
+    """Both in chunks, the second in a world of its own: what either has seen is known, and one wall is not
+    two."""
+    maps, T_today = [], turned_away()
+    for name, m in (("0", made(range(0, 20))), ("1", made(range(12, 32), T_today, "today"))):
+        tm.export_map(m, tmp_path / f"{name}.zarr")
+        maps.append(tm.load_map(tmp_path / f"{name}.zarr"))
+    merged = tm.merge(maps)
+    turned_rad, shifted_m = tangent_norms(T_today @ known(merged.located[0].T_map_recording), np.eye(4))
+    assert np.degrees(turned_rad) < 1
+    assert shifted_m < 0.1  # of the origin of the other world, which is metres away
+    assert len(merged.map.frozen) == 2
+    at_once = frozen(range(2 * COUNT))
+    state = merged.map.marginals.state
+    walls, _ = at_once.marginals.voxels()
+    first = tm.load_map(tmp_path / "0.zarr")
+    found, _ = merged.map.marginals.voxels()
+    assert share_beside(walls, first.marginals.voxels()[0]) < 0.9
+    assert share_beside(walls, found) > 0.95
+    assert share_beside(found, walls) > 0.97
+    assert len(found) < 1.2 * len(walls)
+    grid = np.stack(np.meshgrid(*[np.arange(-3, 3, 0.16)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    grid += np.array(ROOM_IN_WORLD)
+    before, after = at_once.marginals.state(grid), state(grid)
+    free = before == tm.FREE
+    assert (after[free] == tm.FREE).mean() > 0.97
+    assert (after[before == tm.UNKNOWN] == tm.UNKNOWN).mean() > 0.97
+
+
+def share_beside(centres: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    """Share of voxels (n, 3) that have one of others (m, 3) within the size of a voxel."""
+    away_m, _ = cKDTree(others).query(centres)
+    return float((away_m < 1.01 * CONFIG.voxel_size).mean())
+
+
+def known(T: Pose | None) -> Pose:
+    assert T is not None
+    return T
+
+
+def test_a_quarter_turn_moves_frozen_evidence_exactly() -> None:
+    """Voxels come to lie on voxels: all log-odds up to the bound are those of the map that was turned."""
+    m, quarter = frozen(YESTERDAY), np.eye(4)
+    quarter[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    quarter[:3, 3] = np.array([5, -9, 2]) * CONFIG.voxel_size
+    turned = MRFMap.with_noise(CONFIG, m.noise)
+    turned.take_in(m, quarter)
+    turned.infer()
+    centres, p = m.marginals.voxels(min_probability=0.0)
+    moved = centres @ quarter[:3, :3].T + quarter[:3, 3]
+    # Of a brick that is only free, no more is kept than that.
+    prior = m.view.pool.prior_log_odds
+    bounds = [1 / (1 + np.exp(-prior - told)) for told in (-m.LIMITS.message, MOST)]
+    there = np.clip(turned.marginals.occupancy(moved), *bounds)
+    np.testing.assert_allclose(there, np.clip(p, *bounds), rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(turned.marginals.state(moved), m.marginals.state(centres))
+    assert len(turned.marginals.voxels()[0]) == len(m.marginals.voxels()[0])
+    again = turned.marginals.occupancy(moved)
+    for keyframe in made(TODAY).keyframes.values():
+        turned.add(replace(frame_of(keyframe), T_world_camera=quarter @ keyframe.T_world_camera))
+    turned.infer()
+    assert (turned.marginals.occupancy(moved) != again).any()
+    assert len(turned.keyframes) == COUNT
+
+
+def test_a_map_that_is_turned_and_shifted_keeps_its_walls(tmp_path: Path) -> None:
+    """By 37 degrees, half a voxel and more, and saved: no wall is lost, none is doubled."""
+    m, T = frozen(YESTERDAY), np.eye(4)
+    c, s = np.cos(np.radians(37)), np.sin(np.radians(37))
+    T[:3, :3] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    T[:3, 3] = 0.3, -0.11, 0.04
+    turned = MRFMap.with_noise(CONFIG, m.noise)
+    turned.take_in(m, T)
+    turned.infer()
+    turned.save(tmp_path / "turned.npz")
+    turned = MRFMap.load(tmp_path / "turned.npz")
+    assert list(turned.frozen.values()) == list(m.frozen.values())
+    walls, _ = m.marginals.voxels()
+    moved = walls @ T[:3, :3].T + T[:3, 3]
+    found, _ = turned.marginals.voxels()
+    assert share_beside(moved, found) > 0.95
+    assert share_beside(found, moved) > 0.99
+    assert 0.85 < len(found) / len(walls) < 1.1
+
+
+def test_frozen_evidence_moves_and_keyframes_join() -> None:
+    """A later map half of which is frozen."""
+    a, b = made(YESTERDAY), made(TODAY, turned_away(), "today")
+    for id in list(b.keyframes)[::2]:
+        b.freeze_keyframe(id)
+    merged = merge([a, b])
+    assert (len(merged.map.keyframes), len(merged.map.frozen)) == (COUNT + COUNT // 2, COUNT // 2)
+    assert merged.loops > 0
+    centres, _ = made(range(2 * COUNT)).marginals.voxels()
+    near = merged.map.marginals.occupied_within(centres, CONFIG.voxel_size)
+    assert (near > 0.5).mean() > 0.97
 
 
 def of_the_moving_room(seconds: range, T_world_room: Pose) -> MRFMap:

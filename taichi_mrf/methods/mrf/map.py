@@ -6,6 +6,7 @@ parts (parts.py), and of functions that work on them, whose modules are loaded w
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -41,13 +42,14 @@ from taichi_mrf.voxels.topology import Topology
 if TYPE_CHECKING:
     from taichi_mrf.factor_graph import depth_graph
     from taichi_mrf.methods import map_file
-    from taichi_mrf.methods.mrf import moving_window, posed, reading, storage, surfacing
+    from taichi_mrf.methods.mrf import moved_evidence, moving_window, posed, reading, storage, surfacing
     from taichi_mrf.queries import change
     from taichi_mrf.queries.measured_depth import MeasuredDepth
 else:
-    moving_window, posed, reading, storage, surfacing = later(
-        "taichi_mrf.methods.mrf", "moving_window", "posed", "reading", "storage", "surfacing"
-    )
+    moved_evidence, moving_window, posed, reading, storage, surfacing = later(
+        "taichi_mrf.methods.mrf",
+        "moved_evidence", "moving_window", "posed", "reading", "storage", "surfacing",
+    )  # fmt: skip
     (depth_graph,) = later("taichi_mrf.factor_graph", "depth_graph")
     (map_file,) = later("taichi_mrf.methods", "map_file")
     (change,) = later("taichi_mrf.queries", "change")
@@ -259,6 +261,22 @@ class MRFMap(BrickMap):
         are not allocated yet, only free space is kept.
         """
         inferring.freeze_keyframe(self._parts, id)
+
+    def take_in(self, other: "MRFMap", T_map_other: ArrayLike) -> None:
+        """Add what the frozen keyframes of another map say of its voxels, where ``T_map_other`` (4, 4) takes
+        its world to this map's: as evidence, as if they had been frozen here (methods.mrf.moved_evidence).
+        It takes part in the next :meth:`infer`. Their colours and what they measured of the surface stay
+        behind, so the map has no measured surface then.
+
+        Raises ConfigError if the voxels of the maps are not of one size, if evidence in one of them has dates
+        (``time.half_life_s``) or if parts of the other lie on disk, and CapacityError if there is not enough
+        memory.
+        """
+        moved_evidence.check(self.config, other.config, other.window, "the other map")
+        T, free = as_pose(T_map_other), -self.LIMITS.message
+        moved_evidence.add_moved(self._parts, other._parts, free, T, self._next_id)
+        self._next_id += len(other.frozen)
+        self.config = self._parts.config = replace(self.config, keep_surface=False)
 
     def infer(
         self,
