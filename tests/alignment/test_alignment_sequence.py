@@ -6,13 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from inputs_frames import Frames, of_frames
 
 from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.recorded import RecordedPoses
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
@@ -45,19 +46,9 @@ def disturbed(seed: int) -> list[Pose]:
     return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
 
 
-class WrongPoses(Dataset):
+def posed(poses: Sequence[Pose]) -> Frames:
     """The room with the poses of a bad tracker."""
-
-    def __init__(self, poses: Sequence[Pose]) -> None:
-        super().__init__("wrong", true_frames()[0].camera)
-        self.poses = poses
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return [frame.name for frame in true_frames()]
-
-    def read(self, index: int) -> Frame:
-        return replace(true_frames()[index], T_world_camera=self.poses[index])
+    return of_frames([replace(f, T_world_camera=T) for f, T in zip(true_frames(), poses, strict=True)])
 
 
 def errors(poses: Sequence[Pose]) -> np.ndarray:
@@ -110,7 +101,7 @@ def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
 def test_the_pipeline_corrects_poses_and_tells_both() -> None:
     events: list[Event] = []
     wrong = disturbed(1)
-    result = map_sequence(WrongPoses(wrong), REFINE, events.append)
+    result = map_sequence(posed(wrong), REFINE, events.append)
     assert isinstance(result.map, MRFMap)
     assert [change.name for change in result.poses] == [frame.name for frame in true_frames()]
     for change, T_recorded in zip(result.poses, wrong, strict=True):
@@ -142,10 +133,10 @@ def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> Non
     def listen(event: Event) -> None:
         left[0] -= isinstance(event, FrameOffered) and isinstance(event.answer, Added)
 
-    part = map_sequence(WrongPoses(wrong), REFINE, listen, should_stop=lambda: left[0] <= 0)
+    part = map_sequence(posed(wrong), REFINE, listen, should_stop=lambda: left[0] <= 0)
     assert part.interrupted
     assert len(part.poses) == 3
-    whole = map_sequence(WrongPoses(wrong), REFINE, resume_from=part.map)
+    whole = map_sequence(posed(wrong), REFINE, resume_from=part.map)
     assert len(whole.poses) == COUNT
     for change, T_recorded in zip(whole.poses, wrong, strict=True):
         np.testing.assert_array_equal(change.T_recorded, T_recorded)
@@ -159,18 +150,18 @@ def test_a_stop_in_the_rounds_undoes_the_round(monkeypatch: pytest.MonkeyPatch) 
     def stop() -> bool:
         return any(isinstance(event, RoundStep) and event.moved == 3 for event in told)
 
-    stopped = map_sequence(WrongPoses(wrong), REFINE, told.append, should_stop=stop)
+    stopped = map_sequence(posed(wrong), REFINE, told.append, should_stop=stop)
     assert stopped.interrupted
     assert stopped.sweeps == 1
     monkeypatch.setattr(rounds, "MOST_ROUNDS", 0)
-    as_added = map_sequence(WrongPoses(wrong), REFINE)
+    as_added = map_sequence(posed(wrong), REFINE)
     for change, expected in zip(stopped.poses, as_added.poses, strict=True):
         np.testing.assert_array_equal(change.T_refined, expected.T_refined)
 
 
 def test_without_it_nothing_is_moved() -> None:
     wrong = disturbed(1)
-    result = map_sequence(WrongPoses(wrong), replace(REFINE, poses=PoseConfig()), limit=2)
+    result = map_sequence(posed(wrong), replace(REFINE, poses=PoseConfig()), limit=2)
     assert result.poses == []
     for keyframe, T in zip(result.map.keyframes.values(), wrong, strict=False):
         np.testing.assert_array_equal(keyframe.T_world_camera, T)
@@ -178,4 +169,4 @@ def test_without_it_nothing_is_moved() -> None:
 
 def test_only_mrf_maps_can_move_keyframes() -> None:
     with pytest.raises(ConfigError, match=r"poses.refine needs the method mrf"):
-        map_sequence(WrongPoses(disturbed(1)), replace(REFINE, method="log_odds"))
+        map_sequence(posed(disturbed(1)), replace(REFINE, method="log_odds"))

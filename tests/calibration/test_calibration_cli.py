@@ -156,6 +156,7 @@ def test_the_map_takes_what_was_learnt(planes_run: tuple[Path, str], tmp_path: P
     assert used.sigma_table == str((out / "sigma.npy").resolve())
 
 
+@pytest.mark.usefixtures("one_backend")
 def test_a_chessboard_gives_the_true_depth(
     board_recording: Path, board_tables: Tables, tmp_path: Path
 ) -> None:

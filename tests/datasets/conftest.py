@@ -2,16 +2,32 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 from heard import begun
 from inputs_bags import Bag, Kind, write_bag
+from rosbags.serde import cdr, ros1, utils
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.wires import robot as wired
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once() -> Iterator[None]:
+    """rosbags compiles code for each type of each bag, a quarter of what tests of bags take."""
+
+    @cache
+    def compiled(*lines: str) -> ModuleType:
+        return utils.compile_lines(list(lines))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (cdr, ros1):
+            patch.setattr(module, "compile_lines", lambda lines: compiled(*lines))
+        yield
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 of a camera of its own."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +25,18 @@ from datasets_recordings import (
     write_stray,
     write_tum,
 )
+from inputs_frames import Frames, of_frames
 from numpy.typing import NDArray
 
 from taichi_mrf.cli.main import main
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import BuiltIn
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.derived import resampled
 from taichi_mrf.datasets.registry import BUILT_IN
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 from taichi_mrf.geometry.poses import inverse
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.spherical import SphericalCamera
 
@@ -151,23 +152,17 @@ def test_wrong_matrices_are_named(tmp_path: Path, change: dict[str, np.ndarray],
 SCANNER = SphericalCamera(np.linspace(0.5, -0.5, 8), np.linspace(3.0, -3.0, 32))
 
 
-class Scans(Dataset):
+def scans(camera: Camera) -> Frames:
     """Three scans whose pixels count up."""
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return ["a", "b", "c"]
-
-    def read(self, index: int) -> Frame:
-        shape = self.camera.shape
-        count = np.arange(1.0, 1.0 + shape[0] * shape[1], dtype=np.float32).reshape(shape)
-        looked = {"sigma_m": 0.01 * count, "no_return": count % 2 == 0}
-        return Frame(count, np.eye(4), self.camera, float(index), self.frame_names[index], **looked)
+    count = np.arange(1.0, 1.0 + camera.width * camera.height, dtype=np.float32).reshape(camera.shape)
+    looked = {"sigma_m": 0.01 * count, "no_return": count % 2 == 0}
+    frames = [Frame(count, np.eye(4), camera, float(i), "abc"[i], **looked) for i in range(3)]
+    return of_frames(frames, "scans")
 
 
 @pytest.fixture
 def source(monkeypatch: pytest.MonkeyPatch) -> str:
-    built_in = BuiltIn("synthetic:scans", lambda query, options: Scans("scans", SCANNER))
+    built_in = BuiltIn("synthetic:scans", lambda query, options: scans(SCANNER))
     monkeypatch.setitem(BUILT_IN, built_in.name, built_in)
     return built_in.name
 
@@ -204,11 +199,11 @@ def test_a_frame_without_more_says_nothing_of_its_pixels() -> None:
 
 def test_what_belongs_to_pixels_is_picked_with_them() -> None:
     camera = PinholeCamera(8, 6, 9.0, 9.0, 3.5, 2.5)
-    thin = resampled(Scans("scans", camera), (), 2).read(0)
-    full = Scans("scans", camera).read(0)
+    thin = resampled(scans(camera), (), 2).read(0)
+    full = scans(camera).read(0)
     np.testing.assert_array_equal(thin.sigma_m, full.sigma_m[::2, ::2])
     np.testing.assert_array_equal(thin.no_return, full.no_return[::2, ::2])
-    bent = resampled(Scans("scans", camera), (2.0, 0.0, 0.0, 0.0), 1).read(0)
+    bent = resampled(scans(camera), (2.0, 0.0, 0.0, 0.0), 1).read(0)
     outside = bent.depth_m == 0
     assert outside.any()
     assert not bent.no_return[outside].any()

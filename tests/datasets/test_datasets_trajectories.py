@@ -8,7 +8,6 @@ import pytest
 from datasets_recordings import write_stamped
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from inputs_frames import slerp
 from numpy.typing import NDArray
 from refusals import refusal
 from scipy.spatial.transform import Rotation
@@ -35,6 +34,12 @@ def random_poses(count: int) -> NDArray[np.float64]:
         pose[:3, :3] = Q * np.sign(np.linalg.det(Q))
         pose[:3, 3] = random.normal(size=3)
     return poses
+
+
+def slerp(first: Pose, last: Pose, share: float) -> NDArray[np.float64]:
+    """Spherical interpolation of rotations by SciPy."""
+    begin, end = (Rotation.from_matrix(T[:3, :3]) for T in (first, last))
+    return (begin * Rotation.from_rotvec(share * (begin.inv() * end).as_rotvec())).as_matrix()
 
 
 def write(path: Path, *lines: str) -> Path:
@@ -294,7 +299,7 @@ def test_a_pose_in_between_is_scipys(a: tuple, b: tuple, p: tuple, q: tuple, sha
     turn = (Rotation.from_matrix(first[:3, :3]).inv() * Rotation.from_matrix(last[:3, :3])).magnitude()
     np.testing.assert_allclose(between[:3, 3], (1 - share) * np.array(p) + share * np.array(q), atol=1e-12)
     if turn < np.pi - 1e-6:  # beyond, both ways round are as short
-        np.testing.assert_allclose(between[:3, :3], slerp(first[:3, :3], last[:3, :3], share), atol=1e-8)
+        np.testing.assert_allclose(between[:3, :3], slerp(first, last, share), atol=1e-8)
     np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-9)
 
 

@@ -1,16 +1,16 @@
 """--mask and --body-box: what the robot's own body covers is no measurement."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from datasets_recordings import Content, arrays, write_image, write_npz, write_seven_scenes, write_tum
+from inputs_frames import of_frames
 from point_clouds import Walk, write_scans
 from refusals import bad_frame, refused
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.without_body import masked
@@ -80,26 +80,11 @@ def test_a_mask_is_of_turned_images_as_they_are_stored(folder: Path, tmp_path: P
     np.testing.assert_array_equal(seen.read(2).depth_m, holes.read(2).depth_m)
 
 
-@dataclass
-class OneFrame(Dataset):
-    """A source of a frame whose pixels without a depth have no return."""
-
-    frame: Frame | None = None
-
-    @property
-    def frame_names(self) -> list[str]:
-        return ["only"]
-
-    def read(self, index: int) -> Frame:
-        assert self.frame is not None
-        return self.frame
-
-
 def test_masked_pixels_are_never_without_a_return(tmp_path: Path) -> None:
     depth_m = np.arange(192, dtype=np.float32).reshape(12, 16) % 3
     camera = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
     frame = Frame(depth_m, np.eye(4), camera, 0.0, "only", no_return=depth_m == 0)
-    seen = masked(OneFrame("one", camera, frame=frame), mask(tmp_path / "m.png")).read(0)
+    seen = masked(of_frames([frame]), mask(tmp_path / "m.png")).read(0)
     assert seen.no_return is not None
     np.testing.assert_array_equal(seen.no_return, (depth_m == 0) & ~BODY)
     assert not seen.depth_m[BODY].any()

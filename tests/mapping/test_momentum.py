@@ -45,6 +45,7 @@ def swung(stamp_s: float) -> Pose:
     return look_at(eye, eye + np.array([-np.cos(yaw), -np.sin(yaw), -0.2]))
 
 
+@cache
 def measured(pose_at: object, seconds: float, noise: float = 0.0) -> tuple[GyroSamples, AccelerationSamples]:
     """Readings of an IMU at AT_M: by differences of poses (noise in m/s^2, and 0.05 of bias)."""
     stamps, h, random = np.arange(-0.01, seconds, 1 / IMU_HZ), 1e-3, np.random.default_rng(0)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from two_days import CONFIG, COUNT, STOOL, TODAY, YESTERDAY, Recorded, recorded, turned_away
+from inputs_frames import Frames
+from two_days import CONFIG, COUNT, STOOL, TODAY, YESTERDAY, recorded, turned_away
 
 import taichi_mrf as tm
 from taichi_mrf.alignment.whole_map import LocatedRecording
@@ -32,7 +33,7 @@ def saved(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def where_it_is(dataset: Recorded, m: MRFMap) -> Placed:
+def where_it_is(dataset: Frames, m: MRFMap) -> Placed:
     """A dataset of the map's own world."""
     located = LocatedRecording(np.eye(4))
     origin_m = np.zeros(3)

@@ -1,16 +1,15 @@
 """--body-space: where an arm of six joints was, there was nothing of the world; and what is near it stays."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import six_joints as six
+from inputs_frames import of_frames
 from live_scene import marginals
 from numpy.typing import NDArray
 
 import taichi_mrf as tm
-from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL
 from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.without_body import without_body
@@ -23,24 +22,9 @@ STEPS, VOXEL_M, FINE_M, MARGIN_M = 12, 0.03, 0.02, 0.02
 BARE, ARMED = six.frames(STEPS)
 
 
-@dataclass
-class Given(Dataset):
-    """Frames as a dataset."""
-
-    frames: tuple[Frame, ...] = ()
-
-    @property
-    def frame_names(self) -> list[str]:
-        return [frame.name for frame in self.frames]
-
-    def read(self, index: int) -> Frame:
-        return self.frames[index]
-
-
 def seen(folder: Path, frames: list[Frame] = ARMED, **more: str) -> list[Frame]:
     body = OwnBody(**six.write_robot(folder, STEPS), **more)
-    given = Given("arm", frames[0].camera, frames=tuple(frames))
-    return list(without_body(given, body, AS_USUAL))
+    return list(without_body(of_frames(frames), body, AS_USUAL))
 
 
 def mapped(frames: list[Frame], voxel_m: float = VOXEL_M) -> tm.MRFMap:

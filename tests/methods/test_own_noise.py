@@ -9,7 +9,8 @@ import pytest
 import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from live_scene import FakeLink, RoomFrames, finished, marginals, session_of
+from inputs_frames import of_frames
+from live_scene import FakeLink, finished, marginals, session_of
 from numpy.typing import NDArray
 from one_pixel import VOXEL, ExactMap, allocated, random_pose
 from oracles import inference as reference
@@ -202,16 +203,12 @@ def test_recursive_maps_use_and_save_it(tmp_path: Path) -> None:
     assert stored.own.sigma_m is not None
 
 
-class StatingRoom(RoomFrames):
-    def read(self, index: int) -> Frame:
-        return stating(index, COARSE if index == 1 else None)
-
-
 def test_a_live_run_switches_them_off_and_on_bit_for_bit() -> None:
     link = FakeLink()
-    session = session_of(link, StatingRoom("room", small_room.frames()[0].camera, count=3))
+    frames = [stating(0), stating(1, COARSE), stating(2)]
+    session = session_of(link, of_frames(frames))
     before = marginals(finished(session))
-    assert before == marginals(small_room.build([stating(0), stating(1, COARSE), stating(2)]))
+    assert before == marginals(small_room.build(frames))
     for on in (False, True):
         link.ask(Switch(1, on=on))
         assert (marginals(finished(session)) == before) is on

@@ -1,12 +1,10 @@
 """A live run of a lidar: what the page gets of keyframes that have no flat image, and clicks on them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
+from inputs_frames import of_frames
 from live_scene import FakeLink, finished, session_of
 
-from taichi_mrf.datasets import Dataset
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.origins import points_at, starts_at
@@ -28,20 +26,14 @@ HALF_M = np.array([2.2, 1.8, 1.1])
 LIDAR = SphericalCamera(np.linspace(0.5, -0.5, 40), np.linspace(np.pi, -np.pi, 160, endpoint=False))
 
 
-class Scans(Dataset):
-    """Two scans of a room, by a lidar of this camera."""
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return ["scan 0", "scan 1"]
-
-    def read(self, index: int) -> Frame:
-        T = np.eye(4)
-        T[:3, 3] = 0.5 * index, 0.1, 0.0
-        rays, starts = self.camera.rays(), points_at(self.camera, np.zeros(self.camera.shape)) + T[:3, 3]
-        with np.errstate(divide="ignore"):
-            range_m = ((np.copysign(HALF_M, rays) - starts) / rays).min(axis=-1).astype(np.float32)
-        return Frame(range_m, T, self.camera, float(index), self.frame_names[index])
+def session_scan(camera: Camera, index: int) -> Frame:
+    """A scan of a room, by a lidar of this camera."""
+    T = np.eye(4)
+    T[:3, 3] = 0.5 * index, 0.1, 0.0
+    rays, starts = camera.rays(), points_at(camera, np.zeros(camera.shape)) + T[:3, 3]
+    with np.errstate(divide="ignore"):
+        range_m = ((np.copysign(HALF_M, rays) - starts) / rays).min(axis=-1).astype(np.float32)
+    return Frame(range_m, T, camera, float(index), f"scan {index}")
 
 
 MOVES = np.tile(np.eye(4), (160, 1, 1))
@@ -56,7 +48,7 @@ CAMERAS = {
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_keyframes_are_shown_unrolled_and_answer_clicks(camera: Camera) -> None:
     link = FakeLink()
-    session = session_of(link, Scans("scans", camera))
+    session = session_of(link, of_frames([session_scan(camera, index) for index in range(2)]))
     link.ask(Watch(images=True, view=None, baseline=False))
     finished(session)
     assert link.errors() == []
@@ -84,7 +76,3 @@ def test_keyframes_are_shown_unrolled_and_answer_clicks(camera: Camera) -> None:
         assert answer.measured_m == pytest.approx(float(frame.depth_m[v, u]))
         np.testing.assert_allclose(answer.direction, camera.rays()[v, u], atol=1e-6)
         np.testing.assert_allclose(answer.origin, start, atol=1e-6)
-
-
-def session_scan(camera: Camera, index: int) -> Frame:
-    return Scans("scans", camera).read(index)

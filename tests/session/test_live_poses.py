@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tracked_room
+from inputs_frames import Frames, of_frames
 from live_scene import (
     FakeLink,
     asking,
@@ -73,17 +74,9 @@ def wrong_poses() -> list[Pose]:
     return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
 
 
-class WrongPoses(Dataset):
-    @property
-    def frame_names(self) -> list[str]:
-        return [frame.name for frame in true_frames()]
-
-    def read(self, index: int) -> Frame:
-        return replace(true_frames()[index], T_world_camera=wrong_poses()[index])
-
-
-def wrong() -> WrongPoses:
-    return WrongPoses("wrong", true_frames()[0].camera)
+def wrong() -> Frames:
+    pairs = zip(true_frames(), wrong_poses(), strict=True)
+    return of_frames([replace(frame, T_world_camera=T) for frame, T in pairs])
 
 
 def off(poses: list[Pose]) -> np.ndarray:

@@ -1,12 +1,13 @@
 """The live page's past and present: what is sent of a map whose world may change, and what is listed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_room
-from live_scene import CONFIG, FakeLink, RoomFrames, Shown, finished, map_voxels, session_of, shown
+from inputs_frames import Frames, of_frames
+from live_scene import CONFIG, FakeLink, Shown, finished, map_voxels, session_of, shown
 
 from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -36,18 +37,9 @@ def frame(index: int) -> Frame:
     return replace(first, depth_m=depth_m, stamp=START_S + index, name=f"room {index}")
 
 
-@dataclass
-class VisitedRoom(RoomFrames):
+def visited(count: int = FRAMES) -> Frames:
     """The frames above."""
-
-    count: int = FRAMES
-
-    def read(self, index: int) -> Frame:
-        return frame(index)
-
-
-def visited() -> VisitedRoom:
-    return VisitedRoom("visited room", small_room.frames()[0].camera)
+    return of_frames([frame(index) for index in range(count)])
 
 
 def visited_map(time: TimeConfig) -> MRFMap:
@@ -194,5 +186,5 @@ def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPat
 def test_nothing_is_listed_of_a_scene_in_which_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taichi_mrf.session.shown_extras.SHARE_OF_TIME", 1.0)
     link = FakeLink()
-    finished(session_of(link, VisitedRoom("empty", small_room.frames()[0].camera, count=EMPTY), DATED))
+    finished(session_of(link, visited(EMPTY), DATED))
     assert link.of_type(SceneChanges) == []

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from datasets_recordings import quaternion_of
-from inputs_frames import Frames
 
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
@@ -117,7 +116,3 @@ BREAKS: dict[str, Break] = {
     **{name: turned(name) for name in ("turned-left", "upside-down", "turned-right,mirrored")},
     "ned": of_poses(ned),
 }
-
-
-def of_frames(frames: Sequence[Frame]) -> Frames:
-    return Frames("frames", frames[0].camera, frames=frames)

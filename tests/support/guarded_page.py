@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
+from live_program import wait_for
+from raw_viewer_client import RawClient, camera_message, raw_client, widget_message
 
 from taichi_mrf.viewer.transport.server import start_server
 

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets.base import Dataset
@@ -35,6 +37,17 @@ def nanoseconds(stamp: float) -> int:
     return round((START + stamp) * 1e9)
 
 
+@cache
+def types_of(kind: Kind) -> Typestore:
+    """The types of messages of all bags of a kind: the library compiles code for each type of each store."""
+    if kind != "ros1":
+        return get_typestore(Stores.ROS2_HUMBLE)
+    types = get_typestore(Stores.ROS1_NOETIC)  # which has no tf2
+    text = "geometry_msgs/TransformStamped[] transforms"
+    types.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+    return types
+
+
 class Bag:
     """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later, in ROS 1
     from the node ``node``."""
@@ -43,11 +56,7 @@ class Bag:
     node = ""
 
     def __init__(self, kind: Kind, writer: Any) -> None:
-        self.kind, self.writer = kind, writer
-        self.types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-        if kind == "ros1":  # whose store of types has no tf2
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self.types.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.kind, self.writer, self.types = kind, writer, types_of(kind)
         self.connections: dict[str, Any] = {}
 
     def send(self, topic: str, name: str, stamp: float, **fields: Any) -> None:

@@ -10,11 +10,9 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
+from live_program import DEADLINE_S
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
-
-DEADLINE_S = 60.0
-"""For things that happen at once, on a machine that is busy with something else."""
 
 
 class RawClient:
@@ -81,14 +79,6 @@ def raw_client(
         max_size=None,  # as in a browser
     ) as connection:
         yield RawClient(connection)
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Poll until ``condition`` holds."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"{what} did not happen"
-        time.sleep(0.01)
 
 
 def camera_message(**changes: Any) -> dict[str, Any]:

@@ -1,14 +1,15 @@
 """A walk through the built-in room as a camera without poses sees it: what tests of tracking share."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from inputs_frames import Frames, of_frames
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config, EvaluationConfig
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.sensor.frame import Frame
 
@@ -26,30 +27,14 @@ def frames() -> list[Frame]:
     return [replace(dataset.read(i), stamp=i / 10) for i in range(COUNT)]
 
 
-@dataclass
-class Walk(Dataset):
-    """The walk. ``shown`` are the depth images that stand in for some, by index."""
-
-    shown: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
-    order: Sequence[int] = tuple(range(COUNT))
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return [f"walk-{i:03d}" for i in range(len(self.order))]
-
-    def read(self, index: int) -> Frame:
-        frame = frames()[self.order[index]]
-        depth_m = self.shown.get(index, frame.depth_m)
-        stamp = index / 10
-        return replace(
-            frame, depth_m=depth_m, T_world_camera=START, name=self.frame_names[index], stamp=stamp
-        )
-
-
 def walk(
     order: Sequence[int] = tuple(range(COUNT)), shown: Mapping[int, NDArray[np.float32]] | None = None
-) -> Walk:
-    return Walk("walk", frames()[0].camera, tracked=True, order=order, shown=shown or {})
+) -> Frames:
+    """The walk. ``shown`` are the depth images that stand in for some, by index."""
+    images = {i: frames()[number].depth_m for i, number in enumerate(order)} | dict(shown or {})
+    camera = frames()[0].camera
+    walked = [Frame(images[i], START, camera, i / 10, f"walk-{i:03d}") for i in range(len(order))]
+    return of_frames(walked, "walk", tracked=True)
 
 
 def true_pose(index: int) -> Pose:

@@ -1,14 +1,14 @@
 """The built-in room on two days: frames of yesterday, and of today in a world of its own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from inputs_frames import Frames, of_frames
 
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.config.values import overridden
-from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid, translated
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD, camera_pose, chair, room_solids
@@ -54,22 +54,6 @@ STOOL = tuple(chair(0.2, 1.0, 0.4))
 """A chair where nothing else stands."""
 
 
-@dataclass
-class Recorded(Dataset):
-    """Some frames as a recording, in a world that ``T_world_room`` takes the room's to."""
-
-    frames: Sequence[Frame] = ()
-    T_world_room: Pose = field(default_factory=lambda: np.eye(4))
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        return [frame.name for frame in self.frames]
-
-    def read(self, index: int) -> Frame:
-        frame = self.frames[index]
-        return replace(frame, T_world_camera=self.T_world_room @ frame.T_world_camera)
-
-
 def recorded(
     indices: Sequence[int],
     T_world_room: Pose | None = None,
@@ -77,7 +61,9 @@ def recorded(
     name: str = "frame",
     tracked: bool = False,
     around: int = 2 * COUNT,
-) -> Recorded:
+) -> Frames:
+    """Some frames as a recording, in a world that ``T_world_room`` takes the room's to."""
     T = np.eye(4) if T_world_room is None else T_world_room
     frames = [room_frames(added, name, around)[index] for index in indices]
-    return Recorded("the room", CAMERA, tracked=tracked, frames=frames, T_world_room=T)
+    frames = [replace(frame, T_world_camera=T @ frame.T_world_camera) for frame in frames]
+    return of_frames(frames, "the room", tracked=tracked)

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from inputs_frames import of_frames
 from tune_scene import CHOICE, CONFIG, room, working_set
 
 from taichi_mrf.config.schema import KeyframeConfig, SensorConfig
-from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.evaluation.accuracy import OUTLIERS, judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, probability_below
 from taichi_mrf.evaluation.held_out import pooled_depth_error
@@ -49,29 +49,12 @@ def test_frames_are_spread_over_the_sequence_unless_told() -> None:
     assert names(chosen.training) == ["room-0002", "room-0008"]
 
 
-class Broken(Dataset):
-    """The room, with frames that cannot be read."""
-
-    def __init__(self, broken: set[int]) -> None:
-        super().__init__("broken room", room().camera)
-        self.broken = broken
-
-    @property
-    def frame_names(self) -> list[str]:
-        return list(room().frame_names)
-
-    def read(self, index: int) -> Frame:
-        if index in self.broken:
-            raise FrameError(f"frame {index} is damaged")
-        return room().read(index)
-
-
 def test_a_broken_frame_is_left_out_and_named() -> None:
-    frames = read_working_set(Broken({0}), CHOICE)
+    frames = read_working_set(of_frames(list(room()), broken={0}), CHOICE)
     assert len(frames.training) == 5
-    assert frames.skipped == ("frame 0 is damaged",)
-    with pytest.raises(DatasetError, match=r"no training frame.*frame 0 is damaged"):
-        read_working_set(Broken({0, 2}), FrameChoice(stride=1, count=3))
+    assert frames.skipped == ("room-0000: the image is damaged",)
+    with pytest.raises(DatasetError, match=r"no training frame.*room-0000: the image is damaged"):
+        read_working_set(of_frames(list(room()), broken={0, 2}), FrameChoice(stride=1, count=3))
 
 
 def test_a_choice_outside_the_sequence_is_refused() -> None:

@@ -16,7 +16,8 @@ import viser
 import viser._viser
 from hypothesis import given
 from hypothesis import strategies as st
-from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
+from live_program import wait_for
+from raw_viewer_client import RawClient, camera_message, raw_client, widget_message
 from viser._messages import FileTransferStartUpload, Message, ShareUrlDisconnect, ShareUrlRequest
 from websockets.exceptions import ConnectionClosedError
 from websockets.protocol import State

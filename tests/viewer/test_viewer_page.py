@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import viser
 from handled_page import HandledPage
+from live_program import wait_for
 from numpy.typing import NDArray
-from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
+from raw_viewer_client import RawClient, camera_message, raw_client, widget_message
 
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera

@@ -17,7 +17,8 @@ import pytest
 import raw_viewer_client
 import rich
 import viser
-from raw_viewer_client import camera_message, raw_client, wait_for
+from live_program import wait_for
+from raw_viewer_client import camera_message, raw_client
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -375,7 +376,8 @@ def test_it_ends_although_a_client_neither_reads_nor_answers() -> None:
 QUIET_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from raw_viewer_client import camera_message, raw_client, wait_for
+from live_program import wait_for
+from raw_viewer_client import camera_message, raw_client
 from taichi_mrf.viewer.transport.server import start_server
 server = start_server("127.0.0.1", 0, "Quiet")
 with raw_client(server.get_port(), version="0.0.1") as old:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from raw_viewer_client import RawClient, wait_for, widget_message
+from live_program import wait_for
+from raw_viewer_client import RawClient, widget_message
 
 from taichi_mrf.viewer.transport import connection
 from taichi_mrf.viewer.transport.guard import LARGEST_NUMBER, LONGEST_TEXT, is_same, value_to_set

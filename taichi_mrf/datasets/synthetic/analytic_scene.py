@@ -72,12 +72,12 @@ class Scene:
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         nearest = np.full(len(points), np.inf)
-        for solid in sorted(self.solids, key=lambda solid: -ball_radius(solid)):
+        for radius, solid in sorted(((ball_radius(s), s) for s in self.solids), key=lambda pair: -pair[0]):
             # No point of a solid is nearer than the ball around it, so most need no closer look.
-            to_center = points - solid.center
-            reach = nearest + ball_radius(solid)
-            near = (reach > 0) & (np.einsum("ij,ij->i", to_center, to_center) < reach * reach)
-            nearest[near] = np.minimum(nearest[near], distance_to(solid, points[near]))
+            to_center, reach = points - solid.center, np.maximum(nearest + radius, 0.0)
+            near = np.einsum("ij,ij->i", to_center, to_center) < reach * reach
+            if near.any():
+                nearest[near] = np.minimum(nearest[near], distance_to(solid, points[near]))
         return nearest
 
 

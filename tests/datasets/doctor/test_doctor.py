@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from broken_recordings import BREAKS, FLAGS, LATE_S, Break, late, of_depth, of_focal, of_frames, of_poses
+from broken_recordings import BREAKS, FLAGS, LATE_S, Break, late, of_depth, of_focal, of_poses
 from console import carry_out
 from datasets_recordings import stamped_line, write_image
+from inputs_frames import of_frames
 from stereo_rig import write_kitti
 
 from taichi_mrf.config.schema import Config
