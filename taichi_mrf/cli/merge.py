@@ -26,10 +26,11 @@ def run_merge(options: Merge) -> int:
     console = Terminal()
     for path, located in zip(options.maps[1:], merged.located, strict=True):
         console.print_line(f"{path} located: {located.in_words()}")
-    console.print_line(
-        f"{len(merged.map.keyframes)} keyframes, {merged.loops} of them aligned with those of another map, "
-        f"which moved keyframes by up to {100 * merged.moved_m:.1f} cm"
-    )
+    if merged.map.keyframes:
+        console.print_line(
+            f"{len(merged.map.keyframes)} keyframes, {merged.loops} of them aligned with those of another "
+            f"map, which moved keyframes by up to {100 * merged.moved_m:.1f} cm"
+        )
     console.print_line(str(options.out))
     return 0
 
