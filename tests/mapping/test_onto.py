@@ -125,7 +125,7 @@ def test_todays_world_is_taken_to_the_maps(saved: Path) -> None:
     np.testing.assert_allclose(report["T_map_recording"], today.T_map_recording)
 
 
-def mirrored(dataset: Recorded) -> Recorded:
+def mirrored(dataset: Frames) -> Frames:
     """A recording of the mirror image of what another shows: a flat on the other side of the stairs."""
     M = np.diag([-1.0, 1.0, 1.0, 1.0])
     frames = [
