@@ -208,21 +208,24 @@ def averaged(
     noise, and its standard deviation, (H, W) each; 0 where nothing was measured. An edge and a thin thing
     keep their depth. Pixels are ``apart`` columns and rows from each other."""
     depth = np.asarray(depth_m, np.float64)
-    total, count = depth.copy(), np.ones_like(depth)
+    total, pairs = depth.copy(), np.zeros(depth.shape, np.uint8)
     height, width = depth.shape
-    margin = AROUND * apart
+    margin, most = AROUND * apart, SAME_SURFACE * sigma_m
     padded = np.pad(depth, margin)
+    measured = padded > 0
     for down in range(0, margin + 1, apart):
         for right in range(-margin, margin + 1, apart):
             if (down, right) <= (0, 0):
                 continue
-            one, other = (
-                padded[margin + y : margin + y + height, margin + x : margin + x + width]
+            there, opposite = (
+                (slice(margin + y, margin + y + height), slice(margin + x, margin + x + width))
                 for y, x in ((down, right), (-down, -right))
             )
-            same = (one > 0) & (other > 0) & (np.abs(0.5 * (one + other) - depth) < SAME_SURFACE * sigma_m)
-            total += np.where(same, one + other, 0.0)
-            count += 2.0 * same
+            both = padded[there] + padded[opposite]
+            same = (np.abs(0.5 * both - depth) < most) & measured[there] & measured[opposite]
+            total += np.where(same, both, 0.0)
+            pairs += same
+    count = 1.0 + 2.0 * pairs
     return np.where(depth > 0, total / count, 0.0), sigma_m / np.sqrt(count)
 
 
@@ -253,8 +256,14 @@ def _rays_in_area(rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """How many rays pass a square metre at a depth of one, around each pixel, (H, W); 0 where unknown."""
     if min(rays.shape[:2]) < 2:
         return np.zeros(rays.shape[:2])
-    apart = [np.linalg.norm(np.gradient(rays, axis=axis), axis=2) for axis in (0, 1)]
+    apart = [_lengths(np.gradient(rays, axis=axis)) for axis in (0, 1)]
     return 1.0 / np.maximum(apart[0] * apart[1], 1e-12)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of vectors (..., 3), as np.linalg.norm gives them in seven times the time."""
+    x, y, z = (vectors[..., axis] for axis in range(3))
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _sees(
@@ -280,8 +289,8 @@ def _sees(
         pixel = np.clip(v, 0, camera.height - 1) * camera.width + u
     ray = flat[pixel]
     along = np.einsum("ij,ij->i", points_m, ray) / np.einsum("ij,ij->i", ray, ray)
-    apart = np.linalg.norm(points_m - along[:, None] * ray, axis=1)
-    until = measured_m[pixel] + BALL * voxel_size / np.linalg.norm(ray, axis=1)
+    apart = _lengths(points_m - along[:, None] * ray)
+    until = measured_m[pixel] + BALL * voxel_size / _lengths(ray)
     return inside & (measured_m[pixel] > 0) & (along > 0) & (along < until) & (apart < BALL * voxel_size)
 
 

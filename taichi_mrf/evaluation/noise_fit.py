@@ -83,8 +83,8 @@ class Explained:
         place = (np.log2(factor) - OCTAVES[0]) / (OCTAVES[1] - OCTAVES[0])
         place = np.clip(place, 0.0, len(OCTAVES) - 1.0)
         middle = np.clip(np.rint(place).astype(np.int64), 1, len(OCTAVES) - 2)
-        t, pixel = place - middle, np.arange(len(middle))
-        before, at, after = (self.log_likelihood[pixel, middle + k] for k in (-1, 0, 1))
+        t, cell = place - middle, middle + len(OCTAVES) * np.arange(len(middle))
+        before, at, after = (self.log_likelihood.take(cell + k) for k in (-1, 0, 1))
         return float(np.mean(at + t * (0.5 * (after - before) + t * (0.5 * (before + after) - at))))
 
     def under(self, law: SigmaLaw) -> float:
@@ -223,10 +223,10 @@ def sigma_factor(measurements: Explained) -> float:
     return float(2.0 ** octaves[int(np.argmax(means))])
 
 
-def sigma_law(measurements: Explained) -> SigmaLaw:
-    """The law under which the measurements are likeliest."""
+def sigma_law(measurements: Explained, factor: float) -> SigmaLaw:
+    """The law under which the measurements are likeliest, whose :func:`sigma_factor` is ``factor``."""
     stated_m, mean = measurements.stated_m, measurements.under
-    scale = sigma_factor(measurements) * float(np.median(measurements.sigma_m / stated_m))
+    scale = factor * float(np.median(measurements.sigma_m / stated_m))
     middle_m = scale * float(np.median(stated_m))
     starts = [SigmaLaw(scale), SigmaLaw(0.5 * scale, 0.5 * middle_m), SigmaLaw(0.1 * scale, 0.9 * middle_m)]
     return max((_improved(start, mean) for start in starts), key=mean)
@@ -323,7 +323,7 @@ def checked(measured: Explained, frames: int, most: float = DOUBTED) -> NoiseChe
     factor, by = (of_whole, measured) if of_whole > 1.0 else (min(of_none, 1.0), without)
     gain = by.mean(factor * by.sigma_m) - by.mean(by.sigma_m)
     wrong = gain > LEAST_GAIN and not 1.0 / most <= factor <= most
-    return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by) if wrong else None)
+    return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by, factor) if wrong else None)
 
 
 def explained_frame(m: VoxelMap, frame: Frame) -> Explained | None:

@@ -109,7 +109,7 @@ def _pairs(keyframes: Sequence[PosedDepth], poses: Sequence[Pose]) -> list[tuple
     """Pairs of keyframes one of which follows soon after the other, with steps that can be measured."""
     found = []
     for first, keyframe in enumerate(keyframes):
-        least, most = (share * _median_depth(keyframe) for share in STEP)
+        least, most = np.multiply(STEP, _median_depth(keyframe))
         for second in range(first + 1, min(first + 20, len(keyframes))):
             step = float(np.linalg.norm(poses[second][:3, 3] - poses[first][:3, 3]))
             if step > most:
@@ -122,8 +122,8 @@ def _pairs(keyframes: Sequence[PosedDepth], poses: Sequence[Pose]) -> list[tuple
 
 
 def _median_depth(keyframe: PosedDepth) -> float:
-    depth_m = keyframe.depth_m
-    return float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0
+    measured_m = keyframe.depth_m[keyframe.depth_m > 0]
+    return float(np.median(measured_m)) if len(measured_m) else 0.0
 
 
 def _points(keyframe: PosedDepth, noise: NoiseModel, max_depth: float) -> OrientedPoints:

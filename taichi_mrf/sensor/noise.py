@@ -64,8 +64,8 @@ class NoiseTable:
     columns: int
 
     def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        v, u = np.indices(depth_m.shape)
-        row = (v // self.patch) * self.columns + u // self.patch
+        v, u = np.ogrid[: depth_m.shape[0], : depth_m.shape[1]]
+        row = (v // self.patch) * self.columns + u // self.patch if len(self.coefficients) > 1 else 0
         sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
         return np.maximum(sigma, LEAST_SIGMA_M), bias
 

@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import sysconfig
 import threading
 import urllib.request
@@ -15,6 +16,7 @@ import pytest
 from live_program import DEADLINE_S, wait_for
 
 from taichi_mrf.cli.commands import COMMANDS
+from taichi_mrf.cli.start import start
 from taichi_mrf.system import compiler
 
 APPS = {"batch": "map", "live": "live", "tune": "tune"}
@@ -69,6 +71,18 @@ def test_each_file_is_what_its_command_carries_out(repository: Path) -> None:
     assert {path.stem for path in (repository / "apps").glob("*.py")} == set(APPS)
     for name, command in APPS.items():
         assert COMMANDS[command].function == f"taichi_mrf.apps.{name}:run_{command}"
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_products_take_one_thread_unless_more_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, used: str
+) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", given or "")
+    if given is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    monkeypatch.setattr(sys, "argv", ["taichi-mrf", "--version"])
+    assert start() == 0
+    assert os.environ["OPENBLAS_NUM_THREADS"] == used
 
 
 def test_nothing_of_this_package_is_installed_here(python: Path, tmp_path: Path) -> None:

@@ -70,7 +70,8 @@ def test_what_voxels_add_is_set_aside() -> None:
 def test_the_law_of_sigma_is_found() -> None:
     sigma_m = np.random.default_rng(2).uniform(0.002, 0.05, N)
     true_m = 0.02 + 0.7 * sigma_m
-    law = sigma_law(normal(sigma_m, true_m))
+    measured = normal(sigma_m, true_m)
+    law = sigma_law(measured, sigma_factor(measured))
     found_m = law.added_m + law.scale * sigma_m
     # Two parameters: each end of the line is as uncertain as if half of the measurements decided it.
     assert np.abs(np.log(found_m / true_m)).max() < 5.0 / math.sqrt(N / 2) + 0.03
@@ -80,8 +81,8 @@ def test_a_law_over_the_stated_sigma_does_not_depend_on_the_assumed_one() -> Non
     stated_m = np.random.default_rng(3).uniform(0.005, 0.02, N)
     laws = []
     for assumed in (1.0, 2.0):
-        measured = normal(assumed * stated_m, 3.0 * stated_m)
-        laws.append(sigma_law(dataclasses.replace(measured, stated_m=stated_m)))
+        measured = dataclasses.replace(normal(assumed * stated_m, 3.0 * stated_m), stated_m=stated_m)
+        laws.append(sigma_law(measured, sigma_factor(measured)))
     middle_m = float(np.median(stated_m))
     sigmas = [law.added_m + law.scale * middle_m for law in laws]
     assert sigmas == pytest.approx([3.0 * middle_m] * 2, rel=0.03)
