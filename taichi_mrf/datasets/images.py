@@ -12,6 +12,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -168,8 +169,14 @@ def read_depth(
     if path.suffix == ARRAY and steps.dtype.kind in "ui":
         steps = measured(steps)
     elif not (steps.ndim == 2 and steps.dtype.kind == "f"):
-        steps = _of_16_bit(steps, str(path))
+        return np.take(_metres_of_16_bit(steps_per_metre), _of_16_bit(steps, str(path)), mode="clip")
     return without_filling(steps.astype(np.float32) / np.float32(steps_per_metre))
+
+
+@lru_cache(maxsize=4)
+def _metres_of_16_bit(steps_per_metre: float) -> NDArray[np.float32]:
+    """The depth of each number of 16 bits, to look up: to find it takes four times as long."""
+    return without_filling(np.arange(1 << 16, dtype=np.float32) / np.float32(steps_per_metre))
 
 
 def holds_depth(path: Path) -> bool:

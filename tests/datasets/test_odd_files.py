@@ -214,6 +214,19 @@ def test_depth_images_of_other_formats_are_read(tmp_path: Path, suffix: str) -> 
     np.testing.assert_array_equal(read_depth(path, 1000.0), 1.5)
 
 
+@pytest.mark.parametrize("steps_per_metre", [1000.0, 5000.0])
+def test_every_number_of_16_bits_is_its_depth_but_the_largest(tmp_path: Path, steps_per_metre: float) -> None:
+    steps = np.arange(1 << 16, dtype=np.uint16).reshape(256, 256)
+    path = tmp_path / "all.png"
+    assert cv2.imwrite(str(path), steps)
+    expected = steps.astype(np.float32) / np.float32(steps_per_metre)
+    expected[-1, -1] = 0
+    first = read_depth(path, steps_per_metre)
+    np.testing.assert_array_equal(first, expected)
+    first[:] = -1  # an image of its own, not the table
+    np.testing.assert_array_equal(read_depth(path, steps_per_metre), expected)
+
+
 def packed_zeros(codec: str, size: int) -> bytes:
     pack: dict[str, Callable[[bytes], bytes]] = {
         "bz2": bz2.compress,
