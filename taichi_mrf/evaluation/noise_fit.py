@@ -79,7 +79,7 @@ class Explained:
     def mean(self, sigma_m: ArrayLike) -> float:
         """Mean log density with other standard deviations, (n,), to which the voxel's is added; between the
         tried ones by parabolas."""
-        factor = np.hypot(sigma_m, self.voxel_m) / self.sigma_m
+        factor = np.sqrt(np.square(sigma_m) + self.voxel_m**2) / self.sigma_m
         place = (np.log2(factor) - OCTAVES[0]) / (OCTAVES[1] - OCTAVES[0])
         place = np.clip(place, 0.0, len(OCTAVES) - 1.0)
         middle = np.clip(np.rint(place).astype(np.int64), 1, len(OCTAVES) - 2)
