@@ -36,7 +36,7 @@ class DatasetError(TaichiMRFError):
 
 
 class ReadWrongError(DatasetError):
-    """A recording is surely not read as it was written; the text says what is odd, and what reads it."""
+    """A recording is certainly misread; the text says what contradicts, and which command corrects it."""
 
 
 class FrameError(DatasetError):

@@ -271,7 +271,7 @@ def measure_queries(run: BenchRun) -> Measured:
 
 _QUERY_NAMES = {
     "balls": "balls, by clearance",
-    "rays": "rays, to what is occupied",
+    "rays": "rays, to occupied voxels",
     "rays of an image": "rays of an image, by render_depth",
 }
 """Of the rates, those that are called otherwise here."""

@@ -60,8 +60,8 @@ class SensorConfig:
     """Side of the tables' square pixel patches, in pixels."""
 
     pixel_sigma: bool = True
-    """Use each pixel's own standard deviation where frames state one, as those of stereo cameras do. If off,
-    ``sigma`` or its table holds for all pixels."""
+    """Use each pixel's own standard deviation if frames have one, as those of stereo cameras do. If off,
+    ``sigma`` or its table applies to all pixels."""
 
     sigma_scale: float = in_files(1.0)
     """Factor on every standard deviation of ``sigma``, its table or frames. ``map --noise auto`` learns it
@@ -78,18 +78,18 @@ class SensorConfig:
 
     no_return: Literal["ignore", "free", "model"] = "ignore"
     """Use of the pixels that frames mark as having no return. ``free``: space is free up to
-    ``no_return_depth``. ``model`` (mrf only): each surface on the ray may have given none, with a probability
-    set by ``no_return_share``, ``no_return_depth`` and ``no_return_width``."""
+    ``no_return_depth``. ``model`` (mrf only): each surface on the ray may have failed to return the signal,
+    with a probability set by ``no_return_share``, ``no_return_depth`` and ``no_return_width``."""
 
     no_return_share: float = in_files(0.3)
     """Probability that a near surface gives no return, as dark, wet and shiny ones do; below 0.5."""
 
     no_return_depth: float = 10.0
-    """Depth in metres: with ``free``, space is free up to it where there is no return; with ``model``, half
-    of the surfaces that return when near no longer do so here."""
+    """Depth in metres. With ``free``, a pixel without a return marks the space up to this depth as free; with
+    ``model``, half of the surfaces that give a return when near give none at this depth."""
 
     no_return_width: float = in_files(2.0)
-    """Metres over which that half falls with depth: to 27% one width further, to 12% two."""
+    """Metres over which the half that still gives a return falls: to 27% one width further, to 12% two."""
 
     def __post_init__(self) -> None:
         check_field(0 <= self.no_return_share < 0.5, "sensor.no_return_share", "must lie in [0, 0.5)")
@@ -132,11 +132,11 @@ class PoseConfig:
     keyframe keeps its pose."""
 
     close_loops: bool = in_files(True)
-    """When poses are tracked: correct the whole trajectory when the camera comes back to a place that it has
-    seen, and at the end align all keyframes with each other."""
+    """When poses are tracked: correct the whole trajectory when the camera returns to a place that it has
+    seen (loop closure), and at the end align all keyframes with each other."""
 
     translation_sigma: float = in_files(0.03)
-    """Standard deviation of recorded positions along each axis (metres). It weighs recorded poses against
+    """Standard deviation of recorded positions along each axis (metres). It weights recorded poses against
     depth; directions that depth does not determine keep the recorded value."""
 
     rotation_sigma: float = in_files(0.02)
@@ -146,7 +146,7 @@ class PoseConfig:
     """Do not move a keyframe further than this (metres)."""
 
     max_rotation: float = in_python(0.1)
-    """Do not turn a keyframe by more than this (radians)."""
+    """Do not rotate a keyframe by more than this (radians)."""
 
     min_overlap: float = in_python(0.3)
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
@@ -154,11 +154,11 @@ class PoseConfig:
 
     doubt_translation: float = 0.0
     """Standard deviation of each keyframe's position along each axis, relative to keyframes that see the same
-    surfaces (metres). Rays count less where such an error would change what they hit. 0 takes positions as
-    exact."""
+    surfaces (metres). Rays count less where such an error would change which surface they hit. 0 treats
+    positions as exact."""
 
     doubt_rotation: float = 0.0
-    """Standard deviation of each keyframe's orientation about each axis (radians). 0 takes orientations as
+    """Standard deviation of each keyframe's orientation about each axis (radians). 0 treats orientations as
     exact."""
 
     def __post_init__(self) -> None:
@@ -244,7 +244,7 @@ class Config:
     """All parameters of mapping a sequence: those that every method shares, and a section for each method."""
 
     voxel_size: float = 0.05
-    """Side of a voxel, in metres or as 5cm. Unset: 5 cm, or what the recording's depths call for."""
+    """Side of a voxel, in metres or as 5cm. By default 5 cm, or what the depths require."""
 
     method: MethodName = field(
         default=next(iter(METHODS)),
@@ -269,11 +269,11 @@ class Config:
     """Occupancy mapping by wavemap's measurement model (method wavemap)."""
 
     color: bool = False
-    """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
-    them (methods whose maps have colours: mrf)."""
+    """Read the recording's colour images too, and colour voxels and surfaces by the pixels that see them
+    (methods whose maps have colours: mrf)."""
 
     keep_surface: bool = False
-    """Keep the measured surface in each voxel when keyframes' images are dropped, as in freezing and in
+    """Keep the measured surface in each voxel when the images of keyframes are dropped by freezing or in
     submaps (methods that freeze keyframes: mrf)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -295,8 +295,8 @@ class Config:
     """The device that runs the kernels."""
 
     fit_voxel_size: bool = in_python(False)
-    """Take another voxel size where 5 cm fits neither the recording's depths nor its noise. Commands set it
-    where no size is given."""
+    """Choose another voxel size if 5 cm fits neither the recording's depths nor its noise. Commands set it
+    if no size is given."""
 
     def __post_init__(self) -> None:
         ok = 0 < real(self.voxel_size, "voxel_size") < math.inf

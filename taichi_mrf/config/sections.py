@@ -20,16 +20,16 @@ class TimeConfig:
     observation, the less it counts."""
 
     half_life_s: float = 0.0
-    """Seconds after which half of what is known of a voxel is out of date. With 14400 (four hours) a few
-    views show a change, whatever was there before. 0 is a static world, as in surveys."""
+    """Seconds after which half of the knowledge of a voxel is stale. With 14400 (four hours), a few views are
+    enough to show a change, whatever the map held before. 0 means a static world, as in surveys."""
 
     moving_share: float = in_files(1e-6)
-    """Share of space that moving things fill. The smaller it is, the more views it takes until a surface that
-    was seen often counts as gone. Only mrf uses it."""
+    """Share of space that moving objects fill. The smaller it is, the more views it takes until a surface
+    that was seen often counts as gone. Only mrf uses it."""
 
     glimpse_half_life_s: float = in_files(2.0)
-    """Half-life in seconds of a single view that contradicts known free space, such as of a person walking
-    past. Later views confirm or refute it. Only mrf uses it."""
+    """Half-life in seconds of a single view that contradicts known free space, such as a view of a person
+    walking past. Later views confirm or refute it. Only mrf uses it."""
 
     def __post_init__(self) -> None:
         check_field(0 <= self.half_life_s < math.inf, "time.half_life_s", "must not be negative")
@@ -85,9 +85,9 @@ class InferenceConfig:
     1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
 
     pass_through: float | None = None
-    """Probability (below 1) that a ray passes through an occupied voxel, as things fill only part of it. With
-    0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs stay
-    in the map. By default 0.1 for lidar recordings and 0 for others. factor_graph() uses 0."""
+    """Probability (below 1) that a ray passes through an occupied voxel, because objects fill only part of
+    it. With 0, the paper's model, a few passing rays clear a voxel; with 0.1, thin objects such as posts and
+    legs stay in the map. By default 0.1 for lidar recordings and 0 for others. factor_graph() uses 0."""
 
     free_share: float = 0.25
     """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see

@@ -17,33 +17,33 @@ AnyBody = TypeVar("AnyBody", bound="OwnBody")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnBody:
-    """Where the robot itself is. What it covers is no measurement of the world, nor a missing one."""
+    """Where the robot itself is. A pixel on it is neither a measurement of the world nor a missing one."""
 
     mask: str | None = field(default=None, metadata=_FILE)
-    """An image of one channel (PNG), as large as a depth image is stored: 0 is the robot's own body, anything
-    else the world. It has no depth: what it covers stays unknown."""
+    """A single-channel image (PNG) of the size of the stored depth images: 0 marks the robot's own body, any
+    other value the world. A mask has no depth, so the space that it covers stays unknown."""
 
     body_box: tuple[Box, ...] = field(default=(), metadata={"metavar": "X0 Y0 Z0 X1 Y1 Z1"})
-    """A box in the frame of the camera or lidar in metres, in which measurements are of the robot's own body;
-    may be repeated."""
+    """A box in the frame of the camera or lidar, in metres. Measurements in it belong to the robot's own
+    body. The flag may be repeated."""
 
     robot: str | None = field(default=None, metadata=_FILE)
-    """A URDF of the robot. What its geometry covers at the frame's stamp is its own body; what is in front of
-    it stays."""
+    """A URDF of the robot. Pixels that its geometry covers at the frame's stamp show the robot's own body;
+    measurements in front of it stay."""
 
     camera_link: str | None = field(default=None, metadata={"metavar": "NAME"})
     """The link of the URDF whose frame is the camera's (x right, y down, z ahead) or lidar's."""
 
     joints: str | None = field(default=None, metadata=_FILE)
     """Positions of the URDF's joints, in radians or metres: a YAML file of 'name: value', or a .csv table
-    with the columns stamp and a joint each, between whose rows they are linear. Others are at 0."""
+    with the columns stamp and one for each joint, interpolated linearly. Other joints are at 0."""
 
     body_margin: float = 0.02
-    """By how much the URDF's geometry is grown (metres)."""
+    """Margin by which the URDF's geometry is grown (metres)."""
 
     body_space: Literal["free", "unknown"] = "free"
-    """What is known of the space of the URDF's geometry where pixels measure it (mrf only): that nothing else
-    is in it, or not even that."""
+    """State of the space inside the URDF's geometry where pixels measure it (mrf only): free of anything
+    else, or unknown."""
 
     def __post_init__(self) -> None:
         if (self.robot is None) != (self.camera_link is None) or (self.joints and self.robot is None):

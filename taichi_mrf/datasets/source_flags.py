@@ -24,16 +24,16 @@ class SourceFlags(OwnBody):
     """Intrinsics fx,fy,cx,cy in pixels, instead of the recording's."""
 
     undistort: str | None = None
-    """Undo a lens' distortion k1,k2,p1,p2[,k3] (as OpenCV has them); zeros leave the images as they are."""
+    """Undo the lens distortion k1,k2,p1,p2[,k3] (OpenCV's coefficients); zeros leave the images unchanged."""
 
     image_scale: float = 1.0
     """Read 1/n of the rows and columns: 1, 0.5, 0.333, 0.25, ... Pixels are dropped, not averaged."""
 
     max_time_gap: float | None = None
-    """Largest time in seconds from a depth image to a pose; two around it may be twice this apart."""
+    """Largest time in seconds from a depth image to a pose; two poses around it may be twice this apart."""
 
     poses_are: str | None = None
-    """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, with commas between: inverse
+    """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, separated by commas: inverse
     (T_camera_world), wxyz (w first), opengl, ros or ned (axes of the camera), mm or cm (unit),
     late=SECONDS."""
 
@@ -44,8 +44,8 @@ class SourceFlags(OwnBody):
     """Depth along the optical axis, or distance along each pixel's ray."""
 
     image_is: str | None = None
-    """How images are stored, as 'taichi-mrf doctor' finds it, with poses of the sensor: turned-left,
-    turned-right or upside-down, and mirrored (left and right exchanged) with a comma between."""
+    """How images are stored relative to the sensor's poses, as 'taichi-mrf doctor' finds it: turned-left,
+    turned-right or upside-down, and mirrored (left and right exchanged), separated by a comma."""
 
     def words(self) -> list[str]:
         """The flags that differ from the defaults, as they are typed."""

@@ -15,7 +15,7 @@ class ExportOptions:
     """
 
     threshold: float = 0.5
-    """Probability from which a voxel is written as a point or a cube, and at which a mesh lies."""
+    """Lowest probability of a voxel that is written as a point or a cube, and the level of a mesh."""
 
     cubes: bool = False
     """Write voxels as cubes: in .ply, and in .glb, .obj, .stl in place of marching cubes."""
@@ -29,9 +29,9 @@ class ExportOptions:
     measured surface. A .zarr gets it with rays, and with auto after --keep-surface."""
 
     cells: bool = True
-    """Cells of 2, 4 or 8 voxels that reach the threshold though none of their voxels does are written, too,
-    but with --no-cells: in .ply as a point with the property size, in cubes and .html as all their voxels, in
-    .bt and .ot as a larger leaf."""
+    """Write cells of 2, 4 or 8 voxels that reach the threshold although none of their voxels does; --no-cells
+    leaves them out. A cell is a point with the property size in .ply, all its voxels in cubes and .html, and
+    a larger leaf in .bt and .ot."""
 
     color_by: Literal["auto", "marginal", "photo"] = "auto"
     """Colours in .ply, .glb, .obj, .ot, .html and .zarr: of the marginals (not in .ot and .zarr), or of the

@@ -86,15 +86,15 @@ def locate(
     kept: dict[int, Frame] | None = None,
     tell: Tell = lambda text: None,
 ) -> LocatedRecording:
-    """Find a recording in a map whose keyframes were taken in the same place at another time. Where any of
-    them are frozen, it is searched for by what voxels show.
+    """Find a recording in a map whose keyframes were taken in the same place at another time. If any of them
+    are frozen, the recording is located by the map's voxels.
 
     ``frames`` have poses that fit each other, in any world, or are a dataset, whose camera may be tracked.
-    If they are thought to be at ``T_map_recording`` (4, 4), they are looked for only near there. Of an
-    endless dataset, ``kept`` gets the frames that are to be mapped, as they were read, by index, because they
-    are not read again, and ``tell`` is told how far the search is. The answer has ``T_map_recording``, or
-    None and a ``reason``. Raises ConfigError if keyframes cannot be aligned in a map of this method, or if
-    the map has none, and what reading frames raises.
+    With a guess ``T_map_recording`` (4, 4), the search stays near it. For an endless dataset, ``kept``
+    receives the frames to be mapped, by index, because they cannot be read again, and ``tell`` receives the
+    progress of the search. The answer has ``T_map_recording``, or None and a ``reason``. Raises ConfigError
+    if keyframes cannot be aligned in a map of this method, or if the map has none, and what reading frames
+    raises.
     """
     if not can_refine_poses(m):
         raise ConfigError(

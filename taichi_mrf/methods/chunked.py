@@ -136,7 +136,7 @@ class ChunkedMap(PixelReader):
 
     @property
     def pixel_layers(self) -> "Mapping[str, StoredLayer]":
-        """The layers that pixels feed and that the store holds."""
+        """The layers computed from pixels that the store holds."""
         return {name: StoredLayer(self, name) for name in pixel_layers() if name in self.store.layers}
 
     @property

@@ -20,7 +20,7 @@ def create_map(config: Config, camera: Camera) -> OccupancyMap:
 
 def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
     """A saved map of any method; ``memory_limit_gb`` overrides its memory limit. Raises MapFileError, or
-    CapacityError if there is not enough memory for it. One in chunks (.zarr) is as if all was frozen."""
+    CapacityError if there is not enough memory for it. A map in chunks (.zarr) loads as frozen."""
     if is_folder(Path(path)) and Path(path).suffix == SUFFIX:
         return chunked_part.in_memory(chunked.ChunkedMap.open(path), memory_limit_gb)
     with open_map_file(Path(path)) as file:

@@ -13,11 +13,11 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check that a recording is read as it was written, and find the flag that corrects it if not.
+    """Check that a recording is read correctly, and find the flag that corrects it if not.
 
-    The depths of some twenty frames are compared: as read, and with common errors of poses, stamps, units and
-    intrinsics corrected. The exit status is 0 if nothing is odd, 4 if there is something to correct. Example:
-    taichi-mrf doctor recording/ --picture overlap.png
+    Doctor compares the depths of about twenty frames: as read, and with common errors in poses, stamps, units
+    and intrinsics corrected. The exit status is 0 if the frames agree, 4 if something has to be corrected.
+    Example: taichi-mrf doctor recording/ --picture overlap.png
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]

@@ -27,25 +27,25 @@ class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
     On the page, keyframes can be switched off and on, moved and frozen, and rays inspected. The world may
-    change: --time.half-life-s is 14400 here, and 0 (a static world) for map. Ctrl-C ends the run and, with
+    change: --time.half-life-s is 14400 here, but 0 (a static world) for map. Ctrl-C ends the run and, with
     --out, saves the map (exit status 130). Example: taichi-mrf live recording/ --out runs/desk --open
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
-    """A folder, whose format is recognised, a built-in sequence, a camera (realsense:), a robot that runs
-    (foxglove:ws://robot:8765, or zenoh:tcp/robot:7447 of rmw_zenoh), or a saved map (map.npz). Of a folder
-    that holds several recordings or maps, the page offers all; the first is taken."""
+    """A folder, whose format is recognised, a built-in sequence, a camera (realsense:), a running robot
+    (foxglove:ws://robot:8765, or zenoh:tcp/robot:7447 of rmw_zenoh), or a saved map (map.npz). For a folder
+    with several recordings or maps, the page offers all of them and starts with the first."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder for the results, created if needed: map.npz, voxels.ply, config.yaml, report.json,
     trajectory.txt if poses are tracked, and pictures unless the run is stopped."""
 
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace the run that DIR holds. Without it, a folder that holds a run is refused."""
+    """Replace the run that DIR holds. Without this flag, a folder that holds a run is refused."""
 
     onto: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
-    """Go on with the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
-    keyframes join those of the map. A SOURCE that is not found there for sure is refused."""
+    """Continue the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
+    keyframes are added to the map. A SOURCE that cannot be located with certainty is refused."""
 
     frozen: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """With --onto: keep the earlier keyframes as evidence only, without their images."""

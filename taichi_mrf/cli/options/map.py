@@ -29,8 +29,8 @@ class Map:
     it."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; created if needed. With several sources each gets a subfolder named after it,
-    and DIR a summary."""
+    """Folder for the results; created if needed. With several sources, each gets a subfolder named after it,
+    and DIR gets a summary."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
@@ -49,15 +49,15 @@ class Map:
     are skipped."""
 
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace the run that DIR holds. Without it, a run of other parameters is refused."""
+    """Replace the run that DIR holds. Without this flag, a run with different parameters is refused."""
 
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Map a recording that is surely not read as it was written, and keep a map that its held-out frames
-    contradict. Without it, both end with status 4, and so does an empty map."""
+    """Map a recording even if it is certainly misread, and keep a map even if its held-out frames contradict
+    it. Without this flag, both end with status 4, and so does an empty map."""
 
     onto: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
-    """Go on with the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
-    keyframes join those of the map. A SOURCE that is not found there for sure is refused."""
+    """Continue the saved map of an earlier recording, with its parameters: SOURCE is located in it, and its
+    keyframes are added to the map. A SOURCE that cannot be located with certainty is refused."""
 
     frozen: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """With --onto: keep the earlier keyframes as evidence only, without their images."""

@@ -15,8 +15,8 @@ from taichi_mrf.errors import ConfigError
 class Bench:
     """Time a new keyframe of a live map at several voxel sizes, and OctoMap on the same frames.
 
-    The first frames fill the map; medians are of the last ten (of a quarter, if there are fewer than 40).
-    Example: taichi-mrf bench recording/ --voxel-sizes 0.05 0.02 --plot stages.png
+    The first frames fill the map; medians are over the last ten frames (a quarter, if there are fewer than
+    40). Example: taichi-mrf bench recording/ --voxel-sizes 0.05 0.02 --plot stages.png
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
@@ -29,7 +29,7 @@ class Bench:
     """Number of frames to map, from the first on."""
 
     octomap: bool = True
-    """Insert the same frames into OctoMap, where the extra 'bench' is installed."""
+    """Insert the same frames into OctoMap, if the extra 'bench' is installed."""
 
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write all figures to this file as well."""
@@ -73,8 +73,8 @@ class Eval:
     """Folder for the results; created if needed."""
 
     data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
-    """Folder with the scenes, as data/README.md describes them; of table2 also a room of Redwood's, such as
-    livingroom1/."""
+    """Folder with the scenes, as data/README.md describes them; for table2 also one of Redwood's rooms, such
+    as livingroom1/."""
 
     voxel_sizes: tuple[float, ...] = ()
     """Voxel sizes in metres, instead of the experiment's own."""
@@ -89,8 +89,8 @@ class Eval:
     """Run only these parts of the experiment peers, such as 'kitchen*'."""
 
     judge: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None
-    """table3: map the house by a simulated RealSense D435, and judge by another sensor: its parameter file,
-    or kinect_one and the like."""
+    """table3: map the house with a simulated RealSense D435, and evaluate the map with another sensor: its
+    parameter file, or the name of a shipped one such as kinect_one."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

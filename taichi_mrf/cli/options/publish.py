@@ -20,16 +20,16 @@ class PublishFlags:
     """Where the map is served to others."""
 
     publish: Annotated[str | None, tyro.conf.arg(metavar="foxglove[:PORT]|zenoh[:tcp/HOST:PORT]")] = None
-    """Serve the map to Foxglove and to robots while it is made: voxels, the camera's path, tf, an octree for
+    """Serve the map to Foxglove and to robots while it grows: voxels, the camera's path, tf, an octree for
     MoveIt, and the surface once the map has settled. At 127.0.0.1, port 8765; foxglove:0.0.0.0:8765 serves
-    other machines, too. zenoh serves ROS 2 nodes whose middleware is rmw_zenoh, in ROS 2's types: those of
-    this machine, or with zenoh:tcp/robot:7447 a robot's; ?domain=N is their ROS_DOMAIN_ID."""
+    other machines, too. zenoh serves ROS 2 nodes that use rmw_zenoh, with ROS 2's types: those of this
+    machine, or with zenoh:tcp/robot:7447 a robot's; ?domain=N is their ROS_DOMAIN_ID."""
 
     publish_every: Annotated[float, tyro.conf.arg(metavar="S")] = 1.0
     """Shortest time between two messages of a topic, in seconds."""
 
     publish_band: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
-    """Serve a costmap for Nav2 of what lies between these heights, in metres along the axis up."""
+    """Serve a costmap for Nav2 of the obstacles between these heights, in metres along the axis up."""
 
     def __post_init__(self) -> None:
         if self.publish is not None:

@@ -28,15 +28,15 @@ class Export:
     """The files to write."""
 
     layer: Literal["static", "dynamic", "both"] = "both"
-    """Part to write of a map of a changing world: what was always occupied (static), what is occupied now but
-    was free before (dynamic), or both."""
+    """Layer to write of a map of a changing world: voxels that were always occupied (static), voxels that are
+    occupied now but were free before (dynamic), or both."""
 
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Write the map as of this time: a stamp as ``info`` shows them or, if negative, seconds before the
     newest keyframe."""
 
     lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Lower corner (metres) of the box to export from a map in chunks; without it, the box starts where the
+    """Lower corner (metres) of the box to export from a map in chunks. By default, the box starts where the
     map does."""
 
     upper: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
@@ -98,9 +98,9 @@ class Info:
 class Diff:
     """Compare two saved maps voxel by voxel: which states have changed, and by how much probabilities differ.
 
-    B is located in A first if its world is another. What appeared and what left is listed. The maps can be of
-    different methods, but their voxels must be of one size. The exit status is 0 whether they differ or not.
-    Example: taichi-mrf diff monday.npz tuesday.npz --out changes.ply
+    If B has another world frame, it is first located in A. The result lists what appeared and what left. The
+    maps may come from different methods, but must have the same voxel size. The exit status is 0 whether they
+    differ or not. Example: taichi-mrf diff monday.npz tuesday.npz --out changes.ply
     """
 
     a: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
@@ -121,11 +121,11 @@ class Diff:
 
 @dataclass(frozen=True)
 class Merge:
-    """Merge saved maps of one place, each in a world of its own, into one map.
+    """Merge saved maps of one place, each in its own world frame, into one map.
 
-    Each map is located in the others, and keyframes that see the same are aligned with each other; the first
-    map stays where it is, and its parameters hold. A map that is found in no other is refused.
-    Example: taichi-mrf merge monday/map.npz tuesday/map.npz --out both.npz
+    Each map is located in the others, and keyframes that see the same surfaces are aligned with each other;
+    the first map stays in place, and its parameters apply. A map that cannot be located in any other is
+    refused. Example: taichi-mrf merge monday/map.npz tuesday/map.npz --out both.npz
     """
 
     maps: Annotated[

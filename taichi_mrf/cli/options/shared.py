@@ -33,7 +33,7 @@ class Verbosity:
     """How much is printed."""
 
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print only problems, and JSON where it was asked for."""
+    """Print only problems, and JSON if requested."""
 
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print every step instead of a progress bar, and which backend was chosen and why."""
@@ -48,9 +48,9 @@ class NoiseFlags:
     """Source of sigma."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
-    """given: sigma of the parameters. auto: learnt first, from up to 60 frames, and kept in DIR/sensor.yaml
-    for other recordings. checked: given, but map learns it if 8 to 16 frames contradict the default
-    or find a stated one three times too small."""
+    """given: sigma from the parameters. auto: learnt first, from up to 60 frames, and saved in
+    DIR/sensor.yaml for other recordings. checked: given, but map learns it if 8 to 16 frames contradict the
+    default or a stated sigma is three times too small."""
 
     @property
     def is_learnt(self) -> bool:
@@ -77,12 +77,12 @@ class PoseFlags:
     """How far recorded poses are trusted, or what takes their place."""
 
     refine_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Align each new keyframe with those before it, and all with each other at the end; the same as
+    """Align each new keyframe with the earlier ones, and all with each other at the end; the same as
     poses.refine in a file."""
 
     track_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if any, are
-    ignored except for the first. realsense: does so unless it is given poses."""
+    """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if any, are ignored
+    except for the first. For realsense: this is the default, unless poses are given."""
 
     file: Annotated[str | None, tyro.conf.arg(name="poses", metavar="FILE")] = None
     """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log), a pose graph (g2o,
@@ -90,7 +90,7 @@ class PoseFlags:
     own."""
 
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Move keyframes whenever the file of --poses changes during mapping. map ends after the recording, once
+    """Move keyframes whenever the file of --poses changes during mapping. After the recording, map ends once
     the file has been unchanged for 10 s."""
 
     def __post_init__(self) -> None:

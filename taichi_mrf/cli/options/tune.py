@@ -31,7 +31,7 @@ class Tune:
     sensor.yaml with --noise auto."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """A YAML file of parameters to begin with, such as those in configs/."""
+    """A YAML file of initial parameters, such as those in configs/."""
 
     frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Number of frames, held-out ones included; 12 by default, 30 with --auto."""
@@ -43,8 +43,8 @@ class Tune:
     """Take every N-th frame from the first; 0 spreads them evenly over the sequence, at most 10 apart."""
 
     hold_out: Annotated[int, tyro.conf.arg(metavar="N")] = 3
-    """Hold out one frame in N to score the map. With --auto, half of them are kept from the search too, for
-    the final scores."""
+    """Hold out one frame in N to score the map. With --auto, half of them are also withheld from the search,
+    for the final scores."""
 
     auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Search in N trials for parameters that score best on held-out frames (needs the extra auto: Optuna)."""

@@ -16,7 +16,7 @@ DID_NOT_FIT = 3
 """Exit status of a run that ran out of memory: the map of the frames that fit was saved."""
 
 READ_WRONG = 4
-"""Exit status for a recording that is surely not read as it was written, or whose map it contradicts."""
+"""Exit status for a recording that is certainly misread, or that contradicts its map."""
 
 
 def printable(text: str) -> str:

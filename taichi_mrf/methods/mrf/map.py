@@ -66,7 +66,7 @@ class MRFMap(BrickMap):
     """A probabilistic occupancy map of any set of depth keyframes.
 
     Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map depends only
-    on the final set. Until then, queries return what was computed before.
+    on the final set. Until then, queries return the previous results.
     """
 
     METHOD: ClassVar[Method] = METHOD
@@ -145,17 +145,17 @@ class MRFMap(BrickMap):
         """Add a depth image. It takes part in the next :meth:`infer`.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-        ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from
-        which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
-        deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
-        for the model's, and an infinite one means no measurement; ``no_return`` is (H, W), the pixels
-        without a return: bool, used according to ``sensor.no_return``, or float32, the depth up to which each
-        is free (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the pose error xi in
-        the camera frame (metres, then radians) where the true pose is T_world_camera exp(xi), None for an
-        exact pose (sensor/pose_doubt.py); ``images`` are others beside depth, by name, from which layers
-        follow (voxels/layers.py). Returns the id. Raises KeyframeError for a wrong shape or pose and for an
-        invalid covariance, CapacityError if the map would not fit, ConfigError for wrong noise.
+        ``T_world_camera`` is (4, 4); ``stamp_s`` is its time in seconds, by default the number of keyframes
+        added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from which
+        :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard deviation
+        of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand for the
+        model's, and an infinite one means no measurement; ``no_return`` is (H, W), the pixels without a
+        return: bool, used according to ``sensor.no_return``, or float32, the depth up to which each is free
+        (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the pose error xi in the
+        camera frame (metres, then radians) where the true pose is T_world_camera exp(xi), None for an exact
+        pose (sensor/pose_doubt.py); ``images`` are further images beside depth, by name, for layers of voxels
+        (voxels/layers.py). Returns the id. Raises KeyframeError for a wrong shape or pose and for an invalid
+        covariance, CapacityError if the map would not fit into memory, ConfigError for wrong noise.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
@@ -173,7 +173,7 @@ class MRFMap(BrickMap):
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove a keyframe, its messages, and each brick that no other owns. Raises KeyframeError."""
+        """Remove a keyframe, its messages, and the bricks that no other owns. Raises KeyframeError."""
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
@@ -185,8 +185,8 @@ class MRFMap(BrickMap):
         """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped.
 
         ``pose_covariance`` (6, 6) is that of the new pose, as in :meth:`add_keyframe`, zeros if it is exact.
-        Without it the keyframe keeps the covariance that it has. Raises KeyframeError, or CapacityError if
-        there is not enough memory; the map is then unchanged.
+        Without it, the keyframe keeps its covariance. Raises KeyframeError, or CapacityError if there is not
+        enough memory; the map is then unchanged.
         """
         posed.move_keyframe(self._parts, id, T_world_camera, pose_covariance)
 
@@ -201,20 +201,20 @@ class MRFMap(BrickMap):
         """Apply a corrected trajectory, as after a loop closure: poses, id -> (4, 4). ``covariances``, id ->
         (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
 
-        1. Keyframes whose view moves by more than half a voxel are withdrawn: their messages, which are of
-           wrong places, no longer count.
-        2. One by one, all are moved and swept at their new poses, each time the one whose viewpoint is
-           furthest from all keyframes already in place, so that a few soon cover the map.
-        3. Those whose evidence has changed are swept again, as by :meth:`renew`, whose ``tolerance`` this is.
+        1. Keyframes whose view moves by more than half a voxel are withdrawn: their messages belong to wrong
+           places and no longer count.
+        2. One by one, all are moved and swept at their new poses. The next is always the one whose viewpoint
+           is furthest from those already in place, so that a few soon cover the map.
+        3. Stale keyframes are swept again, as by :meth:`renew`; ``tolerance`` is passed to it.
 
         A keyframe stays where it is if nothing in its view would move by more than ``least`` voxels, unless
         it is given another covariance; the pose at which it was placed still counts.
 
-        After ``seconds`` no further keyframe is begun, but one is moved in any case: give ``left`` of the
+        After ``seconds`` no further keyframe is started, but at least one is moved: pass ``left`` of the
         result to the next call. Until then those of ``left`` that were withdrawn have no evidence in the map,
-        unless :meth:`infer`, or :meth:`renew` with their ids, sweeps them at their old poses.
-        Afterwards :meth:`infer` makes, with ``least`` 0, the map that is made anew with these poses, bit for
-        bit, also if this call was interrupted and the poses are given again. Raises KeyframeError for an
+        unless :meth:`infer`, or :meth:`renew` with their ids, sweeps them at their old poses. With ``least``
+        0, :meth:`infer` afterwards gives the same map as one built from scratch with these poses, bit for
+        bit, even if this call was interrupted and the poses are given again. Raises KeyframeError for an
         unknown id or an impossible pose, before anything moves, and CapacityError if there is not enough
         memory for a keyframe's new pose; it and those after it are then as if they were ``left``.
         """
@@ -227,9 +227,9 @@ class MRFMap(BrickMap):
         seconds: float | None = None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
-        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
-        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
+        """Update the marginals incrementally. Sweeps ``keyframes`` (ids) first, then those whose cavity
+        changed, most changed first, until each has had at most the share ``tolerance`` of its voxels'
+        marginals moved since its last sweep (default: ``inference.renew_tolerance``).
 
         Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
         share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
@@ -263,10 +263,10 @@ class MRFMap(BrickMap):
         inferring.freeze_keyframe(self._parts, id)
 
     def take_in(self, other: "MRFMap", T_map_other: ArrayLike) -> None:
-        """Add what the frozen keyframes of another map say of its voxels, where ``T_map_other`` (4, 4) takes
-        its world to this map's: as evidence, as if they had been frozen here (methods.mrf.moved_evidence).
-        It takes part in the next :meth:`infer`. Their colours and what they measured of the surface stay
-        behind, so the map has no measured surface then.
+        """Add the evidence of another map's frozen keyframes, as if they had been frozen here
+        (methods.mrf.moved_evidence). ``T_map_other`` (4, 4) transforms the other world to this map's. The
+        evidence takes part in the next :meth:`infer`. Colours and surface measurements are not transferred,
+        so the map then has no measured surface.
 
         Raises ConfigError if the voxels of the maps are not of one size, if evidence in one of them has dates
         (``time.half_life_s``) or if parts of the other lie on disk, and CapacityError if there is not enough
@@ -287,12 +287,12 @@ class MRFMap(BrickMap):
     ) -> InferReport:
         """Compute the marginals by loopy belief propagation.
 
-        Without ``keyframes`` it starts without messages and sweeps all keyframes in an order that follows
-        from their content, so the map is a function of the set of keyframes. With ``keyframes`` (ids) it
-        starts from the present messages and sweeps only those. ``sweeps`` overrides the configuration for
-        this call. Inference ends early once a sweep has changed at most the share ``tolerance`` of the voxels
-        seen by more than 0.01. ``progress`` is called after each keyframe; returning False stops. Raises
-        ConfigError for an impossible argument, KeyframeError for an unknown id.
+        Without ``keyframes`` it starts without messages and sweeps all keyframes in an order determined by
+        their content, so the map is a function of the set of keyframes. With ``keyframes`` (ids) it starts
+        from the current messages and sweeps only those. ``sweeps`` overrides the configuration for this call.
+        Inference ends early once a sweep has changed at most the share ``tolerance`` of the voxels seen by
+        more than 0.01. ``progress`` is called after each keyframe; returning False stops. Raises ConfigError
+        for an impossible argument, KeyframeError for an unknown id.
         """
         return driven(self.infer_steps(sweeps, tolerance, keyframes), progress)
 
@@ -315,8 +315,8 @@ class MRFMap(BrickMap):
         inferring.go_back(self._parts, checkpoint)
 
     def showing(self, checkpoint: inferring.Checkpoint) -> AbstractContextManager[None]:
-        """While the block runs, all queries and files are those of the map at a checkpoint, as it was at
-        rest: its states, ray casts, layers, surface and colours. The block must not change the map. Since the
+        """Within the block, all queries and files show the map at a checkpoint, as it was at rest: its
+        states, ray casts, layers, surface and colours. The block must not change the map. Since the
         checkpoint only :meth:`infer_steps` may have been begun."""
         return inferring.showing(self._parts, checkpoint)
 
@@ -340,7 +340,7 @@ class MRFMap(BrickMap):
         return footprint.window.bricks_of(footprint.crossed)
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
+        """Number of keyframes that observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
         frozen ones count as one; 255 means 255 or more."""
         inferring.restore_messages(self._parts)
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
@@ -367,7 +367,7 @@ class MRFMap(BrickMap):
 
     @property
     def pixel_layers(self) -> Mapping[str, PixelLayer]:
-        """The layers of voxels that pixels feed, by name (voxels/layers.py). What a pixel says is shared
+        """The voxel layers computed from pixels, by name (voxels/layers.py). A pixel's evidence is divided
         among the voxels on its ray by the probability that it saw them, as of the last :meth:`infer`."""
         return MappingProxyType(self._parts.layers)
 
@@ -404,20 +404,20 @@ class MRFMap(BrickMap):
 
     @property
     def now_s(self) -> float:
-        """The time that the map is for, in seconds: the newest keyframe's stamp; NaN without keyframes."""
+        """The time of the map in seconds: the newest keyframe's stamp; NaN without keyframes."""
         return self._parts.now_s
 
     def at(self, stamp_s: float) -> "reading.MapReading":
         """The map by its marginals as of a time in seconds, from the keyframes up to then. Frozen keyframes
-        count from the time of the newest of them on. Messages are the present ones, which depend on later
-        keyframes too. Raises ConfigError in a map of a static world (``time.half_life_s`` is 0).
+        count from the time of the newest one on. Messages are the current ones, which also depend on later
+        keyframes. Raises ConfigError in a map of a static world (``time.half_life_s`` is 0).
         """
         return self.layer("both", stamp_s)
 
     @property
     def static(self) -> "reading.MapReading":
-        """The static layer: the map without what appeared after its surroundings were mapped. Raises
-        ConfigError in a map of a static world."""
+        """The static layer: the map without the objects that appeared after their surroundings were mapped.
+        Raises ConfigError in a map of a static world."""
         return self.layer("static")
 
     @property
@@ -436,7 +436,7 @@ class MRFMap(BrickMap):
 
     @property
     def decided(self) -> "reading.MapReading":
-        """The map with a decision for each voxel, for ray casts, pictures and exports; :meth:`state`,
+        """The map with a decided state for each voxel, for ray casts, pictures and exports; :meth:`state`,
         :meth:`occupancy` and :meth:`voxels` use it.
 
         Voxels are occupied if their marginal is over one half, or if they win the vote of the rays: each
