@@ -29,6 +29,15 @@ from taichi_mrf.voxels.window import Window
 
 CROSSED, SURFACE = 1, 2
 
+SEEN = 5
+"""Of the eighths of a brick, so many have to be crossed by a keyframe's rays for it to be seen. A brick whose
+corner rays cut has no voxels, and was free as a whole: also the part of a wall in it that nothing saw."""
+
+_EIGHTHS = 2
+"""Lowest bit of the marks of a brick's eighths."""
+
+_ALL_EIGHTHS = 0xFF << _EIGHTHS
+
 
 def find_footprint(
     image: DepthImage,
@@ -55,7 +64,8 @@ def find_footprint(
     window = window_around(lower_m, upper_m, voxel_size, volume)
     if (image.rays == 0 and not no_returns) or window is None:
         nowhere = Window.covering(T_world_camera[:3, 3], T_world_camera[:3, 3], voxel_size)
-        return Footprint(nowhere, np.zeros(0, np.int32), np.zeros(0, np.int32), 1)
+        nothing = np.zeros(0, np.int32)
+        return Footprint(nowhere, nothing, nothing, nothing, 1)
     box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
     # NumPy arrays, which a kernel on the CPU writes in place: small voxels make the window large.
     marks = np.zeros(window.cells, np.int32)
@@ -64,14 +74,18 @@ def find_footprint(
         window.viewpoint(T_world_camera),
         _Marks(window.shape_vector, box_lower, box_upper, marks, longest),
     )
-    _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m), seen)
+    _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m, CROSSED), seen)
     for each in no_returns:
-        reach = _Reach(each.begin_m, each.reach_m, end_sigmas, 0.0)
+        kind = CROSSED | _ALL_EIGHTHS if each.is_sure else CROSSED
+        reach = _Reach(each.begin_m, each.reach_m, end_sigmas, 0.0, kind)
         _mark(each.ray_list, each.image.sensor, view, reach, seen)
     crossed = np.flatnonzero(marks).astype(np.int32)
-    surface = crossed[marks[crossed] & SURFACE != 0]
+    kinds = marks[crossed]
+    surface = crossed[kinds & SURFACE != 0]
+    eighths = np.unpackbits((kinds >> _EIGHTHS).astype(np.uint8)[:, None], axis=1).sum(axis=1)
+    seen = crossed[(eighths >= SEEN) | (kinds & SURFACE != 0)]
     _check_size(len(crossed), len(surface), voxel_size, volume.memory_limit_gb)
-    return Footprint(window, crossed, surface, int(longest[0]))
+    return Footprint(window, crossed, surface, seen, int(longest[0]))
 
 
 def window_around(
@@ -138,6 +152,9 @@ class _Reach(Bundle):
     beyond_m: F32
     """Metres of depth that a ray goes on behind those."""
 
+    kind: I32
+    """Mark of each brick that is crossed."""
+
 
 @dataclass(frozen=True)
 class _Marks(Bundle):
@@ -152,7 +169,7 @@ class _Marks(Bundle):
     upper: Vec3
 
     kinds: I32Array
-    """(bricks of the window): CROSSED, and SURFACE."""
+    """(bricks of the window): CROSSED, SURFACE, and a bit for each eighth that is crossed."""
 
     longest: I32Array
     """(1): a bound on the voxels that any ray crosses."""
@@ -163,16 +180,24 @@ class _Mark(Struct):
     """A ray that marks bricks."""
 
     surface_begin: F32  # depth from which a brick is near the measured surface
+    kind: I32  # of every brick
 
 
 @ti.func
 def _mark_brick(mark: Template, marks: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
     """Mark one brick of a ray."""
-    kind = CROSSED
+    kind, cell = mark.kind, flat(brick, marks.shape)
+    known = marks.kinds[cell]
     if t_leave > mark.surface_begin:
-        kind = CROSSED | SURFACE
-    cell = flat(brick, marks.shape)
-    if (marks.kinds[cell] & kind) != kind:  # most bricks are marked already, and reading is cheaper
+        kind |= SURFACE
+    elif t <= 0.0:  # where the sensor is, nothing else can be
+        kind |= _ALL_EIGHTHS
+    elif (known & _ALL_EIGHTHS) != _ALL_EIGHTHS:
+        for third in ti.static(range(3)):
+            place = ray.origin + (t + (third + 0.5) / 3.0 * (t_leave - t)) * ray.direction - BRICK * brick
+            upper = ti.cast(place >= 0.5 * BRICK, ti.i32)
+            kind |= 1 << (_EIGHTHS + 4 * upper[0] + 2 * upper[1] + upper[2])
+    if (known & kind) != kind:  # most bricks are marked already, and reading is cheaper
         ti.atomic_or(marks.kinds[cell], kind)
     return 1
 
@@ -190,7 +215,7 @@ def _most_voxels(ray: Template, begin: F32, end: F32) -> I32:
 def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: _Marks) -> None:
     """Mark the bricks that each ray crosses."""
     for group in range(rays.group_number):
-        middle, free = block_ray(rays.groups[group], sensor, view), _Mark(FAR)
+        middle, free = block_ray(rays.groups[group], sensor, view), _Mark(FAR, reach.kind)
         apart = end_of_shared_path(rays, group, middle, reach.min_depth, reach.max_depth)
         begin, end = 0.0, apart  # a sweep begins at the camera
         clip(middle, begin, end, marks.lower, marks.upper)
@@ -206,5 +231,5 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
             steps = ti.max(shared + _most_voxels(ray, begin, end), _most_voxels(ray, 0.0, end))
             if steps > marks.longest[0]:
                 ti.atomic_max(marks.longest[0], steps)
-            mark = _Mark(sensor.nearest_depth(measured, noise, reach.end_sigmas))
+            mark = _Mark(sensor.nearest_depth(measured, noise, reach.end_sigmas), reach.kind)
             walk_bricks(ray, begin, end, marks.shape, marks.kinds, False, _mark_brick, mark, marks)

@@ -214,12 +214,14 @@ class RayList(Bundle):
 @dataclass
 class NoReturnRays:
     """The rays of pixels that got no return, of one law (sensor/no_return.py). The depth of their ``image``
-    is that up to which they count, at most ``reach_m``, and ``begin_m`` that from which on they do."""
+    is that up to which they count, at most ``reach_m``, and ``begin_m`` that from which on they do.
+    ``is_sure``: what they pass is known to be free, as the space of the robot's own body is."""
 
     image: DepthImage
     ray_list: RayList
     begin_m: float
     reach_m: float
+    is_sure: bool
 
     @property
     def nbytes(self) -> int:
@@ -232,13 +234,15 @@ class Footprint:
     """Bricks that a depth image's rays cross, which depend on its pose and on nothing else in the map.
 
     ``crossed`` are the window's cells (bricks) that any ray crosses, ``surface`` those among them near a
-    measured surface, both ascending. ``longest`` bounds the voxels on any one ray,
-    with those on the shared path of its group.
+    measured surface, and ``seen`` those of which rays see enough to know that they are free if no surface is
+    near, all ascending. ``longest`` bounds the voxels on any one ray, with those on the shared path of its
+    group.
     """
 
     window: Window
     crossed: Cells
     surface: Cells
+    seen: Cells
     longest: int
 
 

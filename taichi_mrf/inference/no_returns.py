@@ -29,12 +29,13 @@ def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler)
     """
     assert image.own.no_return is not None
     free_m, found = free_up_to_m(image.own.no_return), list[NoReturnRays]()
-    laws = (NoReturnLaw.sure(config), free_m), (NoReturnLaw.of(config), np.where(free_m < 0, np.inf, 0))
-    for law, until_m in laws:
+    sure, unsure = NoReturnLaw.sure(config), NoReturnLaw.of(config)
+    for law, until_m in ((sure, free_m), (unsure, np.where(free_m < 0, np.inf, 0))):
         if law is not None and (until_m > 0).any():
             depth = np.clip(until_m, 0, law.reach_m).astype(np.float32)
             without = DepthImage.upload(depth, image.camera, law)
-            found.append(NoReturnRays(without, bundler.rays_of(without), law.begin_m, law.reach_m))
+            rays = bundler.rays_of(without)
+            found.append(NoReturnRays(without, rays, law.begin_m, law.reach_m, law is sure))
     return tuple(found)
 
 

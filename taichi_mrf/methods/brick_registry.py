@@ -52,7 +52,7 @@ class BrickRegistry:
         if len(missing):
             slots[missing] = self.create(crossed[missing])
         self.pool.owners[slots[surface]] += 1
-        self.topology.add_crossings(crossed, 1)
+        self.topology.add_crossings(footprint.window.bricks_of(footprint.seen), 1)
         return self._list(footprint.crossed, slots)
 
     def anchor_at(self, position_m: NDArray[np.float64]) -> None:
@@ -88,7 +88,7 @@ class BrickRegistry:
 
     def disclaim(self, footprint: Footprint) -> None:
         """Undo :meth:`claim` and release the bricks that are left without an owner."""
-        self.topology.add_crossings(footprint.window.bricks_of(footprint.crossed), -1)
+        self.topology.add_crossings(footprint.window.bricks_of(footprint.seen), -1)
         surface = footprint.window.bricks_of(footprint.surface)
         slots = self.topology.slots(surface)
         self.pool.owners[slots] -= 1
@@ -97,13 +97,13 @@ class BrickRegistry:
             self._release(slots[orphans])
 
     def freeze(self, footprint: Footprint) -> None:
-        """Keep a footprint for good: its bricks stay allocated, and what it crossed stays crossed.
+        """Keep a footprint for good: its bricks stay allocated, and what it has seen stays seen.
 
         All frozen keyframes share one crossing count, which bounds their memory by the space that they saw.
         """
-        crossed = footprint.window.bricks_of(footprint.crossed)
-        self.topology.add_crossings(crossed, -1)
-        self.see_for_good(crossed)
+        seen = footprint.window.bricks_of(footprint.seen)
+        self.topology.add_crossings(seen, -1)
+        self.see_for_good(seen)
 
     def see_for_good(self, bricks: Bricks) -> None:
         """Count bricks (n, 3), without repetitions, as crossed by frozen keyframes."""

@@ -116,6 +116,34 @@ def bricks_met(
     return set(cells[crossed].tolist()), set(cells[surface].tolist())
 
 
+def eighths_met(
+    rays: Rays, window: Window, box: tuple[NDArray, NDArray]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How many eighths of each cell rays cross in front of ``surface``, at least and at most: where they are
+    after 1, 3 and 5 sixths of their way through it. A cell in which a ray begins counts as crossed wholly."""
+    cells = np.arange(window.cells, dtype=np.int32)
+    low = np.stack(np.unravel_index(cells, window.shape), axis=1) * float(BRICK)
+    lower, upper = np.maximum(low, box[0]), np.minimum(low + BRICK, box[1])
+    directions = np.where(rays.directions == 0, 1e-20, rays.directions)
+    least, most = np.zeros((2, window.cells, 8), bool)
+    for direction, begin, end in zip(directions, rays.surface, rays.end, strict=True):
+        a, b = (lower - rays.centre) / direction, (upper - rays.centre) / direction
+        enter, leave = np.minimum(a, b).max(axis=1), np.minimum(np.maximum(a, b).min(axis=1), end)
+        for found, larger in ((least, -GRAZING), (most, GRAZING)):
+            met = (lower < upper).all(axis=1) & (leave - np.maximum(enter, 0) > -larger)
+            met &= leave < begin + larger
+            found[met & (enter < larger)] = True
+            for sixth in (1, 3, 5):
+                place = rays.centre + (enter + sixth / 6 * (leave - enter))[:, None] * direction
+                for shift in np.ndindex(2, 2, 2):
+                    shifted = place + 2 * larger * (np.array(shift) - 0.5)
+                    number = (shifted - low >= BRICK / 2) @ np.array([4, 2, 1])
+                    clear = (np.abs(place - low - BRICK / 2) > GRAZING).all(axis=1)
+                    rows = met & clear if found is least else met
+                    found[rows, number[rows]] = True
+    return least.sum(axis=1), most.sum(axis=1)
+
+
 def whole(window: Window) -> tuple[NDArray, NDArray]:
     return np.zeros(3), np.array(window.shape) * float(BRICK)
 
@@ -128,6 +156,12 @@ def assert_between(footprint: Footprint, rays: Rays, box: tuple[NDArray, NDArray
         assert len(may - must) < 0.1 * len(must)  # or this test would say little
         assert (np.diff(found) > 0).all()
     assert set(footprint.surface.tolist()) < set(footprint.crossed.tolist())
+    # More than half of a brick is seen, or a surface is near.
+    fewest, largest = eighths_met(rays, footprint.window, box)
+    crossed, near, seen = footprint.crossed, set(footprint.surface.tolist()), set(footprint.seen.tolist())
+    assert near | set(crossed[fewest[crossed] > 4].tolist()) <= seen
+    assert seen <= near | set(crossed[largest[crossed] > 4].tolist())
+    assert near < seen < set(crossed.tolist())
 
 
 def every_ray(image: DepthImage) -> RayList:

@@ -111,7 +111,7 @@ class ScanIntegrator:
         if window is None or (image.rays == 0 and missing is None):
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
             start = OneStart(window.viewpoint(T_world_camera).centre)
-            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)), start)
+            return RayFootprint(window, nothing, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)), start)
         ends, starts = ray_ends(
             image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
             discretise=config.discretise, correct_bias=config.correct_bias,
@@ -123,7 +123,7 @@ class ScanIntegrator:
         _mark(ends, starts, window.shape_vector, *box, marks)
         crossed = np.flatnonzero(marks).astype(np.int32)
         self._reserve(len(crossed))
-        return RayFootprint(window, crossed, crossed, 1, ends, starts)
+        return RayFootprint(window, crossed, crossed, crossed, 1, ends, starts)
 
     def integrate(self, footprint: RayFootprint, slots: NDArray[np.int32], pool: BrickPool) -> None:
         """Update the log-odds of the voxels that a scan's rays cross; ``slots`` (n,) are the crossed

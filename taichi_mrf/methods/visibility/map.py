@@ -125,7 +125,7 @@ class VisibilityIntegrator:
             f"a scan of {voxels / 1e6:.3g} million voxels of {self.voxel_size:g} m",
             self.volume.memory_limit_gb,
         )
-        return dataclasses.replace(footprint, surface=footprint.crossed)
+        return dataclasses.replace(footprint, surface=footprint.crossed, seen=footprint.crossed)
 
     def integrate(
         self,

@@ -120,7 +120,7 @@ class BeamIntegrator:
         window = window_around(lower_m - aside_m, upper_m + aside_m, self.voxel_size, self.volume)
         if window is None or beams.number == 0:
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
-            return BeamFootprint(window, nothing, nothing, 1, beams, axes)
+            return BeamFootprint(window, nothing, nothing, nothing, 1, beams, axes)
         place = self._place(window, T_world_camera, axes)
         chunks = np.zeros(window.cells // CHUNK**3, np.int32)
         marks = np.zeros(window.cells, np.int32)
@@ -129,7 +129,7 @@ class BeamIntegrator:
         crossed = np.flatnonzero(marks).astype(np.int32)
         what = f"a scan of {len(crossed) * VOXELS / 1e6:.3g} million voxels of {self.voxel_size:g} m"
         check_memory(4.0 * len(crossed) * VOXELS, what, self.volume.memory_limit_gb)
-        return BeamFootprint(window, crossed, crossed, 1, beams, axes)
+        return BeamFootprint(window, crossed, crossed, crossed, 1, beams, axes)
 
     def integrate(
         self, footprint: BeamFootprint, T_world_camera: Pose, slots: NDArray[np.int32], pool: BrickPool
