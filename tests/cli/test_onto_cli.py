@@ -99,8 +99,19 @@ def test_a_map_in_chunks_is_gone_on_with_and_merged_into(yesterday: Path, tmp_pa
     assert merged.returncode == 0, merged.stderr
     m = tm.load_map(both)
     assert (len(m.keyframes), dict(m.frozen)) == (18, {0: "map.zarr"})
-    refused = taichi_mrf("merge", tmp_path / "alone" / MAP_FILE, chunks, "--out", both)
-    assert_refused(refused, f"{chunks}: frozen keyframes stay where they are: pass it as the first map")
+    # The other way around, and two maps of voxels, the evidence of chunks is moved.
+    assert (
+        taichi_mrf("export", tmp_path / "alone" / MAP_FILE, "--to", tmp_path / "alone.zarr").returncode == 0
+    )
+    for maps, frozen in (
+        ((tmp_path / "alone" / MAP_FILE, chunks), 1),
+        ((chunks, tmp_path / "alone.zarr"), 2),
+    ):
+        merged = taichi_mrf("merge", *maps, "--out", both)
+        assert merged.returncode == 0, merged.stderr
+        assert "% of what is seen agrees" in " ".join(merged.stdout.split())
+        m = tm.load_map(both)
+        assert (len(m.keyframes), len(m.frozen)) == (18 * (frozen == 1), frozen)
 
 
 def test_merge_writes_one_map_of_two(yesterday: Path, tmp_path: Path) -> None:
