@@ -9,7 +9,7 @@ of the recording then confirm it: in the mirror image of a room, a few views fit
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -197,6 +197,9 @@ class Scan(ABC):
     views = RULES.whole_fewest
     """Images that the points are from."""
 
+    names: tuple[str, ...] = ()
+    """Those of the frames."""
+
     around = False
     """True if the sensor sees around."""
 
@@ -333,7 +336,25 @@ def locate_stretch(stretch: Scan, whole: WholeMap, T_map_recording: Pose | None 
     return _judged(stretch, whole, places) if places else LocatedRecording(None, "it fits nowhere")
 
 
-def confirmed(
+def locate_any(
+    stretches: Iterable[Scan], whole: WholeMap, T_map_recording: Pose | None = None, nothing: str = ""
+) -> LocatedRecording:
+    """The place of the first stretch that is found, as :func:`locate_stretch`; those of a list confirm each
+    other. ``nothing`` is the reason if there are none."""
+    best = LocatedRecording(None, nothing)
+    for number, stretch in enumerate(stretches):
+        found = replace(locate_stretch(stretch, whole, T_map_recording), frames=stretch.names)
+        if isinstance(stretches, list):
+            found = _confirmed(found, number, stretches, whole)
+        if found.T_map_recording is not None:
+            return found
+        # Of several refusals the one counts that says most: two places that look alike, or the best fit.
+        if number == 0 or (len(found.places), found.overlap) > (len(best.places), best.overlap):
+            best = found
+    return best
+
+
+def _confirmed(
     found: LocatedRecording, number: int, stretches: Sequence[Scan], whole: WholeMap
 ) -> LocatedRecording:
     """The place that was ``found`` of the stretch with this ``number``, or a refusal if the stretches of the

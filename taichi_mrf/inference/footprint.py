@@ -1,7 +1,7 @@
 """The bricks that a depth image sees: those that its rays cross, and those at the surfaces it measured.
 
 Bricks are allocated near measured surfaces only (section IV-B). The bricks in front of them are recorded too:
-they separate seen-free from unknown space, and give the bricks of other keyframes that the rays cross.
+they give the bricks of other keyframes that rays cross, and those of which rays see most are free space.
 """
 
 from collections.abc import Sequence

@@ -17,7 +17,7 @@ from taichi_mrf.alignment.pairs import fit_to
 from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.seen_through import looked_through
-from taichi_mrf.alignment.whole_map import LocatedRecording, confirmed, locate_stretch
+from taichi_mrf.alignment.whole_map import LocatedRecording, locate_any
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.pose_edge import PoseEdge
@@ -156,14 +156,8 @@ def _found(m: MRFMap, other: MRFMap) -> LocatedRecording:
     """Where a map lies in another: by its keyframes, or, if any are frozen, by its voxels."""
     if not m.frozen:
         return locate(other, [frame_of(keyframe) for keyframe in m.keyframes.values()])
-    whole, refused = whole_map(other), LocatedRecording(None, "too little seen: it has no free space")
     scans = list(scans_of(m, whole_map(m)))
-    for number, scan in enumerate(scans):
-        found = confirmed(locate_stretch(scan, whole), number, scans, whole)
-        if found.T_map_recording is not None:
-            return found
-        refused = refused if number else found
-    return refused
+    return locate_any(scans, whole_map(other), nothing="too little seen: it has no free space")
 
 
 def frame_of(keyframe: Keyframe) -> Frame:

@@ -6,7 +6,7 @@ had been taken in the same run.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,8 +17,7 @@ from taichi_mrf.alignment.whole_map import (
     LocatedRecording,
     Stretch,
     WholeMap,
-    confirmed,
-    locate_stretch,
+    locate_any,
     map_of_voxels,
     walls_of,
 )
@@ -101,21 +100,12 @@ def locate(
             f"a recording is found in maps of the method {methods_with('can_refine_poses')}, "
             f"not {m.METHOD.name}"
         )
-    whole, found = whole_map(m), LocatedRecording(None, "too little seen: no frame measures anything")
-    parts = _stretches(m, frames, {} if kept is None else kept, tell)
-    stretches = (_stretch(m, part) for part in parts)
-    takes_long = isinstance(frames, Dataset) and (frames.endless or frames.tracked)
-    others = [] if takes_long else list(stretches)  # which confirm the one that is found
-    for number, stretch in enumerate(others or stretches):
-        now = replace(locate_stretch(stretch, whole, T_map_recording), frames=stretch.names)
-        if others:
-            now = confirmed(now, number, others, whole)
-        if now.T_map_recording is not None:
-            return now
-        # Of several refusals the one counts that says most: two places that look alike, or the best fit.
-        if not found.frames or (len(now.places), now.overlap) > (len(found.places), found.overlap):
-            found = now
-    return found
+    whole, parts = whole_map(m), _stretches(m, frames, {} if kept is None else kept, tell)
+    stretches: Iterable[Stretch] = (_stretch(m, part) for part in parts)
+    if not (isinstance(frames, Dataset) and (frames.endless or frames.tracked)):
+        stretches = list(stretches)  # the others take long
+    nothing = "too little seen: no frame measures anything"
+    return locate_any(stretches, whole, T_map_recording, nothing)
 
 
 def whole_map(m: MRFMap) -> WholeMap:

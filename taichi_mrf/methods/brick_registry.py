@@ -1,8 +1,8 @@
 """Brick allocation and its two reference counts: owners and ray crossings.
 
 A brick exists as long as at least one keyframe owns it, that is, has measured a surface in it or near it. How
-many keyframes' rays cross a place is counted for all bricks, allocated or not: crossed but not allocated
-means seen to be free. This module does not depend on what inference stores in the voxels.
+many keyframes have seen most of a place (Footprint.seen) is counted for all bricks, allocated or not: seen
+but not allocated means free. This module does not depend on what inference stores in the voxels.
 """
 
 from collections import deque
@@ -106,7 +106,7 @@ class BrickRegistry:
         self.see_for_good(seen)
 
     def see_for_good(self, bricks: Bricks) -> None:
-        """Count bricks (n, 3), without repetitions, as crossed by frozen keyframes."""
+        """Count bricks (n, 3), without repetitions, as seen by frozen keyframes."""
         keys = grid_keys(bricks)
         order = np.argsort(keys)
         keys, bricks = keys[order], bricks[order]

@@ -6,8 +6,8 @@ which together span 8192 bricks along each axis, and the uppermost a map. Vulkan
 there the same interface is served by dense arrays over a bounded volume. Code outside this file does not
 depend on which of the two is used.
 
-Beside its slot each brick has a number of crossings: how many keyframes' rays pass through it. A crossed
-brick without a slot is seen-free space; one that was never crossed is unknown.
+Beside its slot each brick has a number of crossings: how many keyframes' rays see most of it. A brick with
+crossings and without a slot is free space; one with neither is unknown.
 """
 
 import gc

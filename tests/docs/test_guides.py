@@ -61,7 +61,7 @@ def test_own_robot(
     assert printed.startswith("True\n")
     met = re.search(r"(\d+) of 72 rays", printed)
     assert met is not None
-    assert int(met[1]) > 5  # unknown space stops most: 30 views see little of the bricks beside the path
+    assert int(met[1]) > 10
     assert {path.name for path in tmp_path.iterdir()} == {"floor.pgm", "floor.yaml"}
 
 
