@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from taichi_mrf.alignment.locate_recording import LocatedRecording
 from taichi_mrf.alignment.rules import RULES
-from taichi_mrf.alignment.whole_map import LocatedRecording
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import overridden
 from taichi_mrf.datasets import Dataset, open_dataset

@@ -4,8 +4,7 @@ Each new keyframe is aligned with keyframes just before it (steps), and with old
 have come back to: those that are near, as far as the drift since then may be, and look alike (loops). If a
 loop disagrees with the poses, the graph is solved and the map's keyframes move. A loop counts only
 
-- if the new image fits the older surface and hardly looks through any of it: along a corridor walls fit
-  everywhere, but not what stands along them;
+- if the new image fits the older surface and hardly looks through any of it (alignment/pairs.py);
 - if others confirm it, where it would move the map far;
 - if the depth of the keyframes that it joins is not much less likely after that, each in the map of all
   others.
@@ -17,19 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
-from taichi_mrf.alignment.pairs import fit_to
+from taichi_mrf.alignment.pairs import fit_to, loop
 from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.se3 import twist
-from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.mapping.tracking import Tracker
-
-FREE = PoseConfig(translation_sigma=RULES.loop_sigma, rotation_sigma=RULES.loop_sigma)
-"""The guesses of a loop."""
 
 
 @dataclass(frozen=True)
@@ -153,15 +148,8 @@ class LoopCloser:
         turned_there = T_here.copy()
         turned_there[:3, 3] = T_there[:3, 3]
         cells_m = float(np.clip(self._drift_m(id, older), *RULES.loop_cells_m))
-        fit = fit_to(points, surface, [T_here, T_there, turned_there], FREE, cells_m)
-        if fit is None or fit.directions < 6:
-            return None
-        if fit.overlap < RULES.loop_overlap or fit.agreement < RULES.loop_agreement:
-            return None
-        image = self._map.keyframes[id].image
-        if looked_through(surface.planes(), image, fit.T_world_camera) > RULES.lost_through:
-            return None
-        return PoseEdge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
+        there, here = self._map.keyframes[older], self._map.keyframes[id]
+        return loop((older, id), there, surface, here, points, [T_here, T_there, turned_there], cells_m)
 
     def _off(self, edge: PoseEdge) -> tuple[float, float]:
         """Disagreement of an edge with the poses: metres and radians."""

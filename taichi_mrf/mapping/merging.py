@@ -11,19 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taichi_mrf.alignment.map_scan import scans_of
+from taichi_mrf.alignment.locate_recording import LocatedRecording, locate_any
 from taichi_mrf.alignment.oriented_points import oriented_points
-from taichi_mrf.alignment.pairs import fit_to
+from taichi_mrf.alignment.pairs import loop
 from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.rules import RULES
-from taichi_mrf.alignment.seen_through import looked_through
-from taichi_mrf.alignment.whole_map import LocatedRecording, locate_any
+from taichi_mrf.alignment.scan import scans_of
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.mapping.loops import FREE
 from taichi_mrf.mapping.onto import free_prefix, locate, whole_map
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -200,28 +198,18 @@ def _steps_between(
             first = max(0, older.place - RULES.loop_neighbors)
             surface = parts[number].aligner.surface.of(ids[first : older.place + RULES.loop_neighbors + 1])
             T_other_first = older.keyframe.T_world_camera @ inverse(placed[near])
-            guess = T_other_first @ placed[n]
-            fit = fit_to(points, surface, [guess], FREE, RULES.loop_cells_m[0])
-            if fit is None or fit.directions < 6:
-                continue
-            if fit.overlap < RULES.loop_overlap or fit.agreement < RULES.loop_agreement:
-                continue
-            through = looked_through(surface.planes(), node.keyframe.image, fit.T_world_camera)
-            if through <= RULES.lost_through:
-                step = inverse(older.keyframe.T_world_camera) @ fit.T_world_camera
-                yield PoseEdge(near, n, step, fit.information, certain=False)
+            guess, cells_m = T_other_first @ placed[n], RULES.loop_cells_m[0]
+            step = loop((near, n), older.keyframe, surface, node.keyframe, points, [guess], cells_m)
+            if step is not None:
+                yield step
 
 
 def _nearest(nodes: Sequence[_Node], placed: dict[int, Pose], n: int, number: int) -> int | None:
     """The keyframe of another map whose view is nearest to that of a keyframe, if they may see the same."""
-    best, least = None, np.inf
-    for k, other in enumerate(nodes):
-        if other.number == number:
-            turned_rad, apart_m = tangent_norms(placed[n], placed[k])
-            near = apart_m < RULES.view_m and turned_rad < RULES.view_rad
-            if near and turned_rad + apart_m < least:
-                best, least = k, turned_rad + apart_m
-    return best
+    those = [k for k, other in enumerate(nodes) if other.number == number]
+    apart = {k: tangent_norms(placed[n], placed[k]) for k in those}
+    near = [k for k, (rad, m) in apart.items() if rad < RULES.view_rad and m < RULES.view_m]
+    return min(near, key=lambda k: sum(apart[k]), default=None)
 
 
 def _add(m: MRFMap, part: MRFMap, keyframe: Keyframe, T_world_camera: Pose, prefix: str) -> None:

@@ -1,8 +1,8 @@
 """A recording of today in the map of yesterday: found in it, and read in the map's world.
 
-A few stretches of the recording are searched for in what the map's keyframes have measured
-(alignment/whole_map.py). Once one is found, all frames are read where they belong, and are mapped as if they
-had been taken in the same run.
+A few stretches of the recording are searched for in what the map's keyframes have measured, by
+alignment/locate_recording.py. Once one is found, all frames are read where they belong, and are mapped as if
+they had been taken in the same run.
 """
 
 import itertools
@@ -12,15 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.locate_recording import LocatedRecording, locate_any
 from taichi_mrf.alignment.rules import RULES
-from taichi_mrf.alignment.whole_map import (
-    LocatedRecording,
-    Stretch,
-    WholeMap,
-    locate_any,
-    map_of_voxels,
-    walls_of,
-)
+from taichi_mrf.alignment.scan import Scan, scan_of
+from taichi_mrf.alignment.whole_map import WholeMap, map_of_voxels, walls_of
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, KeyframeConfig
 from taichi_mrf.config.text import differences
@@ -30,7 +25,6 @@ from taichi_mrf.datasets.derived import Derived, later
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.geometry.up import up_vector
-from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.mapping.intake import Added, Intake, Lost, Passed
 from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.methods.capabilities import can_freeze, can_refine_poses
@@ -101,7 +95,7 @@ def locate(
             f"not {m.METHOD.name}"
         )
     whole, parts = whole_map(m), _stretches(m, frames, {} if kept is None else kept, tell)
-    stretches: Iterable[Stretch] = (_stretch(m, part) for part in parts)
+    stretches: Iterable[Scan] = (scan_of(part, m.config.sensor, m.noise) for part in parts)
     if not (isinstance(frames, Dataset) and (frames.endless or frames.tracked)):
         stretches = list(stretches)  # the others take long
     nothing = "too little seen: no frame measures anything"
@@ -134,15 +128,6 @@ def _stretches(
     if frames.tracked:
         return _tracked_live(m, frames, kept, tell) if frames.endless else _tracked(m, frames)
     return _posed(frames.read, len(frames), kept if frames.endless else None, tell)
-
-
-def _stretch(m: MRFMap, part: Sequence[Frame]) -> Stretch:
-    images = []
-    for frame in part:
-        depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
-        images.append(DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor)))
-    poses, colors = [frame.T_world_camera for frame in part], [frame.color for frame in part]
-    return Stretch(images, poses, m.sensor.max_depth, colors, tuple(frame.name for frame in part))
 
 
 STANDS_S = 10.0

@@ -8,17 +8,12 @@ import pytest
 from two_days import CAMERA, CONFIG, SIGMA_M, TODAY, YESTERDAY, room_frames, turned_away
 
 import taichi_mrf as tm
-from taichi_mrf.alignment.whole_map import (
-    LocatedRecording,
-    Stretch,
-    locate_stretch,
-    map_of_voxels,
-    walls_of,
-)
+from taichi_mrf.alignment.locate_recording import LocatedRecording, locate_stretch
+from taichi_mrf.alignment.scan import Scan, scan_of
+from taichi_mrf.alignment.whole_map import map_of_voxels, walls_of
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.geometry.poses import Pose, inverse, look_at, tangent_norms
-from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.mapping.onto import locate, whole_map
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.frame import Frame
@@ -45,10 +40,9 @@ def shot(scene: Scene, poses: Sequence[Pose]) -> list[Frame]:
     return frames
 
 
-def stretch_of(frames: Sequence[Frame], T_away: Pose) -> Stretch:
-    images = [DepthImage.upload(frame.depth_m, CAMERA, NOISE) for frame in frames]
-    poses, colors = [T_away @ frame.T_world_camera for frame in frames], [frame.color for frame in frames]
-    return Stretch(images, poses, 10.0, colors)
+def stretch_of(frames: Sequence[Frame], T_away: Pose) -> Scan:
+    moved = [replace(frame, T_world_camera=T_away @ frame.T_world_camera) for frame in frames]
+    return scan_of(moved, CONFIG.sensor, NOISE)
 
 
 def painted(frames: Sequence[Frame], brightness: Callable[[np.ndarray], np.ndarray]) -> list[Frame]:

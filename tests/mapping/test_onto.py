@@ -9,7 +9,7 @@ from inputs_frames import Frames
 from two_days import CONFIG, COUNT, STOOL, TODAY, YESTERDAY, recorded, turned_away
 
 import taichi_mrf as tm
-from taichi_mrf.alignment.whole_map import LocatedRecording
+from taichi_mrf.alignment.locate_recording import LocatedRecording
 from taichi_mrf.config.schema import Config, KeyframeConfig, PoseConfig, TimeConfig
 from taichi_mrf.datasets.base import EndlessNames
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
