@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import viser
@@ -14,7 +14,7 @@ from taichi_mrf.viewer.live.time_strip import TimeStrip
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
 from taichi_mrf.viewer.scene.map_scene import GROWING
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.view_options import ViewOptions, drawings_of
+from taichi_mrf.viewer.scene.view_options import Draw, ViewOptions
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
 
@@ -81,7 +81,7 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
-        self._no_surface = ""
+        self._no_surface, self._chosen = "", (ViewOptions().draw_as, ViewOptions().color_by)
         self._all = (0.0, 0.0)
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
@@ -166,26 +166,32 @@ class Panel(BasePanel):
 
     def show_lack_of_surface(self, why: str) -> None:
         """While there is no surface, offer voxels alone, in the colours that they have in its place, with a
-        tooltip that says ``why``; if that is empty, the surface again."""
+        tooltip that says ``why``; if that is empty, show again what was chosen before."""
         drawn, colors = (self.view_options.handles[name] for name in ("draw_as", "color_by"))
         had, has, self._no_surface = not self._no_surface, not why, why
         said = f"The map is drawn as voxels. There is no surface: {why}."
         change(drawn, hint=field_help(ViewOptions)["draw_as"] if has else said)
         if had == has:
             return
-        first = ViewOptions()
-        if has and colors.value == GROWING:
-            colors.value = first.color_by
-        elif not has and (drawn.value, colors.value) == (first.draw_as, first.color_by):
+        if has:
+            drawn.options = get_args(Draw)
+            drawn.value = self._chosen[0]
+            if colors.value == GROWING:
+                colors.value = self._chosen[1]
+            return
+        first, self._chosen = ViewOptions(), (drawn.value, colors.value)
+        drawn.options = ("voxels",)
+        if self._chosen == (first.draw_as, first.color_by):
             colors.value = GROWING
-        drawn.options = drawings_of(self._hello) if has else ("voxels",)
-        drawn.value = drawn.options[0]
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         h, activity = self._hello, status.activity
         if h.has_surface:
-            self.show_lack_of_surface(status.no_surface)
+            past = (
+                "it is made of the map as it is now, and this is an earlier time" if self.time.is_past else ""
+            )
+            self.show_lack_of_surface(status.no_surface or past)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
         if not (status.voxels or self._names):

@@ -6,11 +6,11 @@ the last words of the panel, which may be "done". So the script asks each second
 answer, and hides what the panel says is being done. It lets the client connect again also without the focus,
 and reloads the page of a server that answers while the socket stays closed.
 
-The script also gives the page the colours that the system prefers until a user turns them over, shows the
-tooltips of labels, and on a phone folds the panel at first, makes it as wide as the window, opens it for the
-answer to a click, and leaves out viser's initial view of wide windows, which may come after the page's own. It writes the view into the page's
-address when its user asks for a link, and begins with the view of such an address in place of the first one
-that the server sends.
+The script also gives the page the colours that the system prefers until a user turns them over, and shows the
+tooltips of labels. On a phone it folds the panel at first, makes it as wide as the window, opens it for the
+answer to a click, and leaves out viser's initial view of wide windows, which may come after the page's own.
+It writes the view into the page's address when its user asks for a link, and begins with the view of such an
+address in place of the first one that the server sends.
 """
 
 import http
