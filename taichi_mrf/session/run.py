@@ -28,6 +28,7 @@ from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.pictures import outlined
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
+from taichi_mrf.session.shown_extras import lack_of_surface
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
@@ -107,6 +108,7 @@ class Progress:
             mapper.edits.can_undo,
             mapper.edits.can_redo,
             self._arrivals(replay),
+            lack_of_surface(mapper.map),
         )
 
     def time_left(self, replay: Replay) -> str:

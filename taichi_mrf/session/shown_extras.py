@@ -45,6 +45,16 @@ from taichi_mrf.voxels.layers import LAYERS, Chunk, imported, pixel_layers
 from taichi_mrf.voxels.layout import BRICK, VOXELS, by_chunk, grid_keys
 
 
+def lack_of_surface(m: OccupancyMap) -> str:
+    """In words, why no surface can be made of a map; empty if there is one, or will be with keyframes."""
+    if not measures_surface(m):
+        return f"a map of the method {m.config.method} has none"
+    if m.keeps_surface or not m.frozen:
+        return ""
+    text = f"the images of {len(m.frozen)} frozen keyframes are no longer in memory"
+    return f"{text}; --keep-surface keeps what they say of it"
+
+
 class ShownSurface:
     """Makes the measured surface of one map anew when that has changed, chunk by chunk, and a view of it."""
 
@@ -63,12 +73,8 @@ class ShownSurface:
         times in a second; what it raises ends the work. Raises ConfigError if the map cannot make a surface
         of all its keyframes, CapacityError, TaichiMRFError."""
         m, state = self._mapper.map, self._state
-        if not measures_surface(m):
-            raise ConfigError(f"a map of the method {m.config.method} has none")
-        if not m.has_surface:
-            frozen = self._mapper.roster.frozen
-            text = f"the images of {frozen} frozen keyframes are no longer in memory"
-            raise ConfigError(f"{text}; --keep-surface keeps what they say of it")
+        if not measures_surface(m) or lack_of_surface(m):
+            raise ConfigError(lack_of_surface(m))
         found = m.surface(between)
         vertices_m = smooth_borders(found.vertices_m, found.triangles)
         surface = DrawnSurface(vertices_m, found.triangles, found.normals, found.colors)

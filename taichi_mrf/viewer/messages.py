@@ -186,7 +186,8 @@ class Status(Update):
     ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
     pace (0: as fast as possible), None where frames have none. ``free_space`` says how sure free space is, if
     frames were held out for that. ``can_undo``, ``can_redo``: edits can be taken back, or made again.
-    ``arrivals`` says how the frames of a sensor that runs come, empty for any other source."""
+    ``arrivals`` says how the frames of a sensor that runs come, empty for any other source; ``no_surface``
+    why no surface can be made of the map, empty if one can."""
 
     activity: str
     share: float
@@ -206,6 +207,7 @@ class Status(Update):
     can_undo: bool = False
     can_redo: bool = False
     arrivals: str = ""
+    no_surface: str = ""
 
 
 @dataclass(frozen=True)

@@ -507,6 +507,31 @@ def test_nothing_is_cut_off(
         assert "Map" in page.page.evaluate(CUT_OFF)
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_on_a_phone_an_answer_is_read_below_the_middle_and_closed(
+    program: LiveProgram, browser: "Browser", scheme: Literal["dark", "light"]
+) -> None:
+    with LivePage(browser, program.address, 390, 844) as page:
+        page.page.emulate_media(color_scheme=scheme)
+        page.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "the map")
+        places = [*page.places("/voxels/", "points"), *page.places("/surface/", "vertices")]
+        nearest = min(page.free_places(places[::20]), key=lambda place: place[2])
+        page.click(*nearest[:2])
+        close = page.page.get_by_role("button", name="Close", exact=True)
+        cell = page.page.get_by_role("cell", name="probability", exact=True)
+        lines = [cell, page.page.get_by_text("alone each would say"), close]
+
+        def can_be_read(seen: Seen) -> bool:
+            boxes = [line.bounding_box() for line in lines if line.count()]
+            return len(boxes) == 3 and all(b and 422 < b["y"] < b["y"] + b["height"] <= 844 for b in boxes)
+
+        page.until(can_be_read, "the answer in the lower half of the window")
+        page.screenshot(f"phone_answer_{scheme}")
+        close.click()
+        page.until(lambda seen: not page.input("Draw as").is_visible(), "the folded panel")
+        assert page.problems == []
+
+
 def test_the_ground_and_the_axes_come_and_go(page: LivePage, saved: MRFMap) -> None:
     levels_m, voxels = np.unique(saved.decided.voxels(0.5)[0][:, 2], return_counts=True)
     floor_m = levels_m[np.argmax(voxels)]

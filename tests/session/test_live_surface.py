@@ -78,7 +78,9 @@ def test_the_page_gets_the_surface_of_the_map_when_it_shows_it() -> None:
     link.ask(Freeze(0))
     finished(session)
     assert not any(len(patch.triangles) for patch in latest_patches(link))  # it would lack a part
-    assert link.of_type(Notice)[-1].text.startswith("no surface: the images of 1 frozen keyframes are no")
+    why = link.of_type(Status)[-1].no_surface
+    assert link.of_type(Notice)[-1].text == f"no surface: {why}"
+    assert why.startswith("the images of 1 frozen keyframes are no")
     assert link.errors() == []
 
 

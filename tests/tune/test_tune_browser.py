@@ -76,6 +76,18 @@ def test_the_page_begins_with_the_scores_of_the_parameters_in_force(page: LivePa
     page.screenshot("tune_parameters")
 
 
+@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (390, 844), (1280, 1000)])
+def test_the_tabs_stand_in_one_row(page: LivePage, width: int, height: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": height})
+    page.until(lambda seen: page.input("Surface density (per m)").is_visible(), "the panel")
+    page.pause(0.5)
+    boxes = [tab.bounding_box() for tab in page.page.get_by_role("tab").all() if tab.is_visible()]
+    assert len(boxes) == 7
+    assert len({box["y"] for box in boxes if box}) == 1
+    assert all(box and box["x"] >= 0 and box["x"] + box["width"] <= width for box in boxes)
+    page.screenshot(f"tune_{width}")
+
+
 def test_a_slider_brings_a_new_score_and_another_map(page: LivePage) -> None:
     before, likelihood = page.look(), score(page, "fit, log-likelihood ↑")
     page.slide("Surface density (per m)", 5.0)

@@ -15,6 +15,7 @@ from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.live.panel import Clicked
 from taichi_mrf.viewer.scene import coloring
+from taichi_mrf.viewer.scene.base_panel import OptionsMoved
 from taichi_mrf.viewer.scene.coloring import COLORINGS, Coloring, Measure, legend_html
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
 from taichi_mrf.viewer.scene.view_options import ViewOptions
@@ -33,6 +34,7 @@ HELLO = m.Hello(
     has_colors=True,
     has_surface=True,
 )
+DONE = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
 VIEW = m.SurfaceView(
     eye_m=np.array([3.0, -9.0, 5.0]),
     target_m=np.array([3.0, -3.0, 1.5]),
@@ -218,6 +220,29 @@ def test_a_map_without_a_surface_offers_none() -> None:
         assert running.page.panel.view_options.handles["draw_as"].options == ("voxels",)
         assert running.page.options.draw_as == "voxels"
         assert running.asked == []
+    finally:
+        running.server.stop()
+
+
+def test_while_a_map_has_no_surface_the_panel_says_voxels_and_why() -> None:
+    running = SurfacePage()
+    try:
+        widgets = running.page.panel.view_options.handles
+        shown = [widgets[name] for name in ("draw_as", "color_by")]
+        for frozen in (1, 2):
+            running.take(replace(DONE, no_surface=f"{frozen} images are gone"), OptionsMoved())
+            assert [widget.value for widget in shown] == ["voxels", "marginal probability"]
+            assert widgets["draw_as"].options == ("voxels",)
+            assert widgets["draw_as"].hint.endswith(f"There is no surface: {frozen} images are gone.")
+        assert running.page.options.draw_as == "voxels"
+        assert "512 voxels" in running.draw(draw_as="voxels", color_by="marginal probability")
+        assert "chance that a voxel is occupied" in running.page.panel._legend.content
+        running.take(HELLO, DONE)  # another map, which has one
+        assert [widget.value for widget in shown] == ["surface", "height"]
+        assert "There is no surface" not in widgets["draw_as"].hint
+        widgets["color_by"].value = "uncertainty"
+        running.take(replace(DONE, no_surface="all images are gone"))
+        assert [widget.value for widget in shown] == ["voxels", "uncertainty"]
     finally:
         running.server.stop()
 

@@ -17,6 +17,7 @@ from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
+DONE = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
 START_S = 1.7e9
 NOTHING = np.zeros((0, 3), np.int32)
 
@@ -60,6 +61,22 @@ def test_the_right_end_is_now_and_follows(running: TimePage) -> None:
     assert (slider.max, slider.value) == (9.0, 2.5)
     running.span(9.0)
     assert slider.value == 9.0
+
+
+def test_at_an_earlier_time_the_voxels_of_then_are_drawn_and_not_the_surface_of_now() -> None:
+    page = TimePage()
+    page.take(replace(HELLO, has_surface=True))
+    drawn, colors = (page.page.panel.view_options.handles[name] for name in ("draw_as", "color_by"))
+    for chosen, then in (("height", "marginal probability"), ("uncertainty", "uncertainty")):
+        drawn.value, colors.value = "surface", chosen
+        page.span(9.0, shown_s=2.5)
+        page.take(DONE)
+        assert (drawn.value, drawn.options, colors.value) == ("voxels", ("voxels",), then)
+        assert "this is an earlier time" in drawn.hint
+        page.span(9.0)
+        page.take(DONE)
+        assert (drawn.value, colors.value) == ("surface", chosen)
+    page.server.stop()
 
 
 def test_the_past_begins_at_the_newest_frozen_keyframe(running: TimePage) -> None:

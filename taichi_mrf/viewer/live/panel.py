@@ -2,17 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from taichi_mrf.config.text import field_help
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.time_strip import TimeStrip
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Event, Tell, rows_html
+from taichi_mrf.viewer.scene.map_scene import GROWING
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
-from taichi_mrf.viewer.scene.view_options import ViewOptions
+from taichi_mrf.viewer.scene.view_options import Draw, ViewOptions
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
 
@@ -79,6 +81,7 @@ class Panel(BasePanel):
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi, tell: Tell) -> None:
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
+        self._no_surface, self._chosen = "", (ViewOptions().draw_as, ViewOptions().color_by)
         self._all = (0.0, 0.0)
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
@@ -127,6 +130,7 @@ class Panel(BasePanel):
         self._hello = hello
         self.show_recording(hello)
         self.time.begin(hello.has_dates)
+        self.show_lack_of_surface("")
         self.offer(hello)
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
@@ -160,9 +164,34 @@ class Panel(BasePanel):
         if (now.draw_as, now.color_by) == (first.draw_as, first.color_by):
             self.view_options.handles["color_by"].value = "photo"
 
+    def show_lack_of_surface(self, why: str) -> None:
+        """While there is no surface, offer voxels alone, in the colours that they have in its place, with a
+        tooltip that says ``why``; if that is empty, show again what was chosen before."""
+        drawn, colors = (self.view_options.handles[name] for name in ("draw_as", "color_by"))
+        had, has, self._no_surface = not self._no_surface, not why, why
+        said = f"The map is drawn as voxels. There is no surface: {why}."
+        change(drawn, hint=field_help(ViewOptions)["draw_as"] if has else said)
+        if had == has:
+            return
+        if has:
+            drawn.options = get_args(Draw)
+            drawn.value = self._chosen[0]
+            if colors.value == GROWING:
+                colors.value = self._chosen[1]
+            return
+        first, self._chosen = ViewOptions(), (drawn.value, colors.value)
+        drawn.options = ("voxels",)
+        if self._chosen == (first.draw_as, first.color_by):
+            colors.value = GROWING
+
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         h, activity = self._hello, status.activity
+        if h.has_surface:
+            past = (
+                "it is made of the map as it is now, and this is an earlier time" if self.time.is_past else ""
+            )
+            self.show_lack_of_surface(status.no_surface or past)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
         if not (status.voxels or self._names):

@@ -49,6 +49,11 @@ class TimeStrip:
         self.strip.visible = has_dates
         self._show_list()
 
+    @property
+    def is_past(self) -> bool:
+        """True if the map of an earlier time is shown."""
+        return self._span is not None and self._span.shown_s is not None
+
     def chosen_s(self) -> float | None:
         """The stamp of the time on the slider, None at its right end, which is now."""
         if self._span is None or self.slider.value >= self.slider.max - 0.5 * TIME_STEP_S:

@@ -6,11 +6,11 @@ the last words of the panel, which may be "done". So the script asks each second
 answer, and hides what the panel says is being done. It lets the client connect again also without the focus,
 and reloads the page of a server that answers while the socket stays closed.
 
-The script also gives the page the colours that the system prefers until a user turns them over, shows the
-tooltips of labels, and on a phone folds the panel at first, makes it as wide as the window, and leaves out
-viser's initial view of wide windows, which may come after the page's own. It writes the view into the page's
-address when its user asks for a link, and begins with the view of such an address in place of the first one
-that the server sends.
+The script also gives the page the colours that the system prefers until a user turns them over, and shows the
+tooltips of labels. On a phone it folds the panel at first, makes it as wide as the window, opens it for the
+answer to a click, and leaves out viser's initial view of wide windows, which may come after the page's own.
+It writes the view into the page's address when its user asks for a link, and begins with the view of such an
+address in place of the first one that the server sends.
 """
 
 import http
@@ -73,6 +73,7 @@ window.Worker = class extends Worker {  // viser's socket lives in one, which te
         }
         theme.dark_mode = scheme() === "dark";
       }
+      if (data?.messages?.some(({type}) => type.startsWith("Gui"))) setTimeout(showAnswer, 200);
       if (data?.type === "connected") [wasOpen, closed] = [true, false];
       if (data?.type === "closed") [closed, hasClosed] = [true, true];
     });
@@ -93,11 +94,23 @@ system.addEventListener("change", () => {
   const data = {type: "message_batch", messages: [{...theme, dark_mode: false}]};
   if (theme) socket.dispatchEvent(new MessageEvent("message", {data}));
 });
-const fold = () => {
-  const head = document.querySelector('[style*="cursor: pointer"][style*="; height: 3.5em"]');
-  head ? head.click() : requestAnimationFrame(fold);
+const headOfSheet = () => document.querySelector('[style*="cursor: pointer"][style*="; height: 3.5em"]');
+const fold = () => headOfSheet() ? headOfSheet().click() : requestAnimationFrame(fold);
+const narrow = matchMedia("(max-width: 36em)");  // the width from which on viser has a floating panel
+if (narrow.matches) fold();
+let answer = "", opened = false;  // what the answer says, and whether it has opened the panel of a phone
+const showAnswer = () => {
+  const head = narrow.matches && document.querySelector('[aria-label$=" panel Answer"]');
+  const said = head?.nextElementSibling?.textContent ?? "";
+  const isOpen = headOfSheet()?.nextElementSibling?.offsetHeight > 0;
+  if (!head && opened && isOpen) headOfSheet().click();
+  if (!head) opened = false;
+  if (head && said !== answer) {
+    if (!isOpen) [opened] = [true, headOfSheet().click()];
+    for (const ms of [0, 500, 1500]) setTimeout(() => head.scrollIntoView(), ms);  // while it grows
+  }
+  answer = said;
 };
-if (matchMedia("(max-width: 36em)").matches) fold();  // the width from which on viser has a floating panel
 for (const [event, inner] of [["mouseover", "mouseenter"], ["mouseout", "mouseleave"]])
   document.addEventListener(event, ({target}) => {  // the label of a widget shows its tooltip, too
     const widget = target.matches?.("label[for]") && target.parentElement.parentElement.nextElementSibling;
@@ -112,6 +125,9 @@ style.textContent = `
   [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }
+    [style*="position: fixed"][style*="width: 20em"]:has([aria-label$=" panel Answer"]) {
+      max-height: 45% !important; }  /* what was clicked on stays in sight */
+    [aria-label^="Collapse panel "] + div { height: auto !important; }  /* 0 if it was opened unseen */
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
   }
   html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }

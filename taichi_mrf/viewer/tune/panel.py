@@ -57,33 +57,32 @@ class TunePanel(BasePanel):
         with gui.add_folder("More scores", expand_by_default=False):
             self._more_scores = gui.add_html("")
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
+        with tabs.add_tab("Parameters"):
             for section, title in _FOLDERS.items():
                 folder = gui.add_folder(title, expand_by_default=section != "keyframes")
                 self._folders[section] = folder
                 with folder:
                     self.knobs.add(section)
-        with tabs.add_tab("Search", viser.Icon.SEARCH):
+        with tabs.add_tab("Search"):
             self._search_tab()
-        with tabs.add_tab("Views", viser.Icon.PHOTO):
+        with tabs.add_tab("Views"):
             self._views_tab()
-        with tabs.add_tab("Tries", viser.Icon.HISTORY):
+        with tabs.add_tab("Tries"):
             self._tries_tab()
-        with tabs.add_tab("Noise", viser.Icon.CHART_DOTS):
+        with tabs.add_tab("Noise"):
             self.noise = NoisePlot(gui)
             self.knobs.add("sensor")
-        with tabs.add_tab("Map", viser.Icon.CUBE):
+        with tabs.add_tab("Map"):
             self.add_buttons("Look from", [side.capitalize() for side in get_args(Side)])
             self.add_legend()
             self.add_layers("changes", "points", "baseline", "follow")
             self.add_button(*self.DARK_OR_LIGHT)
-        with tabs.add_tab("Frames", viser.Icon.MOVIE):
+        with tabs.add_tab("Frames"):
             self._frame_text = gui.add_markdown("")
             self.frames = OptionWidgets(gui, t.FrameChoice(), lambda: None)
             self.frames.add()
             hint = "Start again with these frames. The table of tries is emptied."
             self.add_button("Use these frames", hint)
-        with tabs.add_tab("About", viser.Icon.INFO_CIRCLE):
             self._about = gui.add_html("")
             self.add_notices()
 
