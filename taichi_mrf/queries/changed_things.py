@@ -6,6 +6,7 @@ voxels that were free and are occupied, or the reverse.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -140,14 +141,22 @@ class ChangedThing:
         return 0.5 * (self.lower_m + self.upper_m)
 
 
+def _both_ways(
+    change: MapChange, a: VoxelMap, b: VoxelMap
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int32], VoxelMap, VoxelMap]]:
+    """Of what appeared, and of what left: rows (n,) of the change, their voxels (n, 3), the map in which they
+    are free, and the one in which they are occupied."""
+    for before, after, free_in, occupied_in in ((FREE, OCCUPIED, a, b), (OCCUPIED, FREE, b, a)):
+        rows = np.flatnonzero((change.before == before) & (change.after == after))
+        yield rows, np.floor(change.points[rows] / a.voxel_size).astype(np.int32), free_in, occupied_in
+
+
 def without_slack(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_VOXELS) -> MapChange:
     """Voxels that appeared or left from map a to map b, without what can be a surface of the other map that
     has shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
-    voxels = np.floor(change.points / a.voxel_size).astype(np.int32)
-    kept = np.zeros(len(voxels), np.bool_)
-    for before, after, other in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
-        rows = np.flatnonzero((change.before == before) & (change.after == after))
-        kept[rows] = stands_clear(voxels[rows], Surfaces(other.view.pool, other.voxel_size), core)
+    kept = np.zeros(len(change.points), np.bool_)
+    for rows, voxels, free_in, _ in _both_ways(change, a, b):
+        kept[rows] = stands_clear(voxels, Surfaces(free_in.view.pool, free_in.voxel_size), core)
     return _chosen(change, kept)
 
 
@@ -162,19 +171,20 @@ def _chosen(change: MapChange, kept: NDArray[np.bool_]) -> MapChange:
     )
 
 
-def amid_known(change: MapChange, a: VoxelMap, b: VoxelMap, core: int = CORE_VOXELS) -> MapChange:
-    """Voxels that appeared or left, without clusters of which fewer than ``core`` voxels have only known ones
-    beside them in the map in which they are free: at the edge of what that map has seen, the surface of the
-    other map may begin in the next voxel."""
+def surely_changed(change: MapChange, a: VoxelMap, b: VoxelMap) -> MapChange:
+    """Voxels that appeared or left, without clusters of which fewer than CORE_VOXELS are sure: occupied by
+    their marginal, and in the map in which they are free clear of its surfaces and with only known voxels
+    beside them. Where few rays of one keyframe vote for a surface, one ray at a slant makes the same place
+    free, and at the edge of what a map has seen the surface of the other may begin in the next voxel."""
     kept = np.zeros(len(change.points), np.bool_)
     beside = a.voxel_size * np.concatenate([np.eye(3), -np.eye(3)])
-    for before, after, free_in in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
-        rows = np.flatnonzero((change.before == before) & (change.after == after))
+    for rows, voxels, free_in, occupied_in in _both_ways(change, a, b):
         points = change.points[rows]
-        known = np.ones(len(rows), np.bool_)
+        sure = occupied_in.marginals.state(points) == OCCUPIED
+        sure &= Surfaces(free_in.decided.view.pool, a.voxel_size).clear(voxels)
         for step in beside:
-            known &= free_in.state(points + step) != UNKNOWN
-        kept[rows] = _in_clusters(np.floor(points / a.voxel_size).astype(np.int32), known, core)
+            sure &= free_in.state(points + step) != UNKNOWN
+        kept[rows] = _in_clusters(voxels, sure, CORE_VOXELS)
     return _chosen(change, kept)
 
 
@@ -210,9 +220,9 @@ def find_changed_things(
 
 
 def things_between(change: MapChange, a: VoxelMap, b: VoxelMap) -> list[ChangedThing]:
-    """Things that appeared or left between two maps of other views, the largest first: without surfaces that
-    have shifted a little or that one map has not seen, and without sheets of less than three voxels, such as
-    a table's top that one of the maps has seen at a slant only."""
-    clear = amid_known(without_slack(change, a, b), a, b)
-    things = find_changed_things(clear, a.voxel_size, CORE_VOXELS, max(PARTS_M, a.voxel_size))
+    """Things that appeared or left between two maps of other views (:func:`compare_maps`), the largest first:
+    those that are sure (:func:`surely_changed`), without sheets of less than three voxels, such as a table's
+    top that one of the maps has seen at a slant only."""
+    sure = surely_changed(change, a, b)
+    things = find_changed_things(sure, a.voxel_size, CORE_VOXELS, max(PARTS_M, a.voxel_size))
     return [thing for thing in things if thing.size_m.min() > 2.5 * a.voxel_size]

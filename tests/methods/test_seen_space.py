@@ -34,7 +34,12 @@ def test_hardly_any_inside_of_a_solid_is_free() -> None:
     assert free[height_m < -voxel_m].mean() < 0.015
 
 
-def test_two_walks_through_one_room_find_nothing_changed() -> None:
-    first, second = mapped(range(15), 0.1), mapped(range(15, 30), 0.1)
-    assert things_between(tm.compare_maps(first, second), first, second) == []
-    assert things_between(tm.compare_maps(second, first), second, first) == []
+@pytest.mark.parametrize(
+    ("first", "second", "voxel_m"),
+    [(range(15), range(15, 30), 0.1), (range(0, 30, 3), range(1, 30, 3), 0.05)],
+)
+def test_two_walks_through_one_room_find_nothing_changed(first: range, second: range, voxel_m: float) -> None:
+    """Also where few rays of one keyframe say "occupied", and one ray at a slant says "free"."""
+    a, b = mapped(first, voxel_m), mapped(second, voxel_m)
+    assert things_between(tm.compare_maps(a, b), a, b) == []
+    assert things_between(tm.compare_maps(b, a), b, a) == []
