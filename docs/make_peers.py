@@ -1,10 +1,10 @@
-"""Makes pictures and table of every peer in docs/evaluation.md from `taichi-mrf eval peers` (extra `bench`).
+"""Makes pictures and tables of every peer in docs/evaluation.md from `taichi-mrf eval peers` (extra `bench`).
 
     python docs/make_peers.py ../shared/data
 
-The results are kept in runs/peers, so that a run that was stopped continues; all of it takes hours. The
-figures of the rows that docs/results/peers.csv has go there, and from there into the pages
-(result_tables.py).
+The results are kept in runs/peers, so that a run that was stopped continues; all of it takes an hour or two.
+The figures of the rows that docs/results/peers.csv and peers_space.csv have go there, and from there into the
+pages (result_tables.py).
 """
 
 import csv
@@ -22,7 +22,7 @@ PICTURES: dict[str, list[str]] = {
     "peers_kitchen.png": ["--only", "kitchen*"],
     "peers_room.png": ["--only", "room, 5 cm*", "room, 2 cm, [MOhlvT]*", "room, 1 cm, [MlT]*"],
     "peers_house.png": ["--only", "house, 5 cm*", "house, 2 cm, [MhlT]*", "house, 1 cm, [MT]*"],
-    "peers_lidar.png": ["--only", "lidar, 20 cm*", "lidar, 5 cm, [Mhl]*", "--voxel-sizes", "0.2", "0.05"],
+    "peers_lidar.png": ["--only", "lidar, 20 cm*", "lidar, 5 cm, [MOhl]*", "--voxel-sizes", "0.2", "0.05"],
 }
 """The pictures, each with its arguments: the systems by their first letters where not all were measured."""
 
@@ -31,15 +31,17 @@ def main() -> None:
     """Run each part, copy its picture, and take its figures."""
     if len(sys.argv) != 2:
         sys.exit(__doc__)
-    figures: result_tables.Rows = {}
+    figures: dict[str, result_tables.Rows] = {"peers.csv": {}, "peers_space.csv": {}}
     for name, arguments in PICTURES.items():
         run = ["eval", "peers", "--data", sys.argv[1], "--out", str(OUT), *arguments]
         subprocess.run([sys.executable, "-m", "taichi_mrf", *run], check=True)
         shutil.copyfile(OUT / name, IMAGES / name)
-        figures |= budgets(OUT / "peers_budgets.csv")
-    path = result_tables.RESULTS / "peers.csv"
-    columns, rows = result_tables.read(path)
-    result_tables.write(path, columns, {key: figures[key] for key in rows})
+        figures["peers.csv"] |= budgets(OUT / "peers_budgets.csv")
+        figures["peers_space.csv"] |= spaces(OUT / "peers_states.csv")
+    for file, found in figures.items():
+        path = result_tables.RESULTS / file
+        columns, rows = result_tables.read(path)
+        result_tables.write(path, columns, {key: found[key] for key in rows})
     result_tables.main()
 
 
@@ -54,6 +56,21 @@ def budgets(path: Path) -> result_tables.Rows:
         right = [figure(cell.split(" / ")[0], 3) if "/" in cell else "-" for cell in cells]
         likely = figure(cells[-1].split(" / ")[1], 2) if "/" in cells[-1] else "-"
         found[row["scene"], row["voxels"], row["system"]] = [*right, likely]
+    return found
+
+
+def spaces(path: Path) -> result_tables.Rows:
+    """The rows that the command wrote on known space: MRFMap's by its calibrated probabilities, and by its
+    mesh, which stands with the marginals."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    found: result_tables.Rows = {}
+    for row in rows:
+        name, _, reading = row["map"].partition(", ")
+        cells = [row["occupied precision"], row["occupied recall"], row["calibration error"], row["F 2 cm"]]
+        new = [figure(cell, 3) if cell else "-" for cell in cells]
+        mesh = found.get((row["scene"], row["voxels"], name), new)[-1] if reading == "calibrated" else new[-1]
+        found[row["scene"], row["voxels"], name] = [*new[:-1], mesh]
     return found
 
 
