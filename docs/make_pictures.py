@@ -25,7 +25,6 @@ import page_pictures  # noqa: E402
 from browser import LivePage, chromium  # noqa: E402
 from live_program import LiveProgram  # noqa: E402
 from PIL import Image  # noqa: E402
-from tune_program import TuneProgram  # noqa: E402
 
 import taichi_mrf  # noqa: E402
 
@@ -120,9 +119,9 @@ def _live_page(*arguments: str) -> Iterator[LivePage]:
 def the_tuning_page() -> Iterator[LivePage]:
     """The tuning page of twelve frames of the room."""
     with (
-        TuneProgram(ROOM, "--voxel-size", "0.05", "--port", "0") as program,
+        LiveProgram(ROOM, "--voxel-size", "0.05", command="tune") as program,
         chromium() as browser,
-        LivePage(browser, program.address(), WIDTH, 1160) as page,
+        LivePage(browser, program.address, WIDTH, 1160) as page,
     ):
         page.until(lambda seen: seen.settled and seen.voxels, "the first map")
         page_pictures.make_tries(page)

@@ -270,6 +270,15 @@ def full_pictures(small_pictures: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Figure, "savefig", small_pictures)
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A Chromium that runs while the tests of a file do."""
+    from browser import chromium
+
+    with chromium() as running:
+        yield running
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the source tree."""

@@ -24,10 +24,13 @@ from taichi_mrf.alignment.point_to_plane import PointToPlane
 from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.scan import Scan
+from taichi_mrf.alignment.seen_through import through_and_seen
+from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.alignment.whole_map import WholeMap
 from taichi_mrf.alignment.wide_search import best_poses, level_frame, upright
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
+from taichi_mrf.inference.keyframe import DepthImage
 
 UNKNOWN = np.full((6, 6), np.inf)
 
@@ -158,6 +161,33 @@ def _confirmed(
         return found
     reason = f"where a part fits best, the others would look through {through:.0%} of what is mapped"
     return replace(found, T_map_recording=None, reason=f"another place: {reason}")
+
+
+class PlaceCheck:
+    """Doubts where a recording was located once what is mapped there does not fit: once its keyframes look
+    through a larger share of the map's ``walls`` than ``most``."""
+
+    def __init__(self, walls: Planes, most: float) -> None:
+        self._walls, self._most = walls, most
+        self._keyframes = self._through = self._seen = 0
+        self._is_doubtful = False
+
+    def take(self, image: DepthImage, T_map_camera: Pose) -> str:
+        """Take the image of a keyframe, at its pose (4, 4) in the map. Returns why the place is in doubt, if
+        that shows with this keyframe, else an empty text."""
+        through, seen = through_and_seen(self._walls, image, T_map_camera)
+        self._keyframes += 1
+        self._through += through
+        self._seen += seen
+        share = self._through / max(1, self._through + self._seen)
+        if self._is_doubtful or self._keyframes < RULES.whole_frames or share <= self._most:
+            return ""
+        self._is_doubtful = True
+        return (
+            f"the recording may have been located in a wrong place: its first {self._keyframes} keyframes "
+            f"look through {share:.0%} of what the map has there, and {self._most:.0%} at most are usual; or "
+            "its poses drift, or much has been moved since"
+        )
 
 
 def _candidates(scan: Scan, whole: WholeMap) -> list[Pose]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.sensor.camera import sees_around
 
 BIN_RAD = np.radians(2.0)
 """Side of the bins of azimuth and elevation in which the nearest and the farthest measurement are kept."""
@@ -55,6 +56,10 @@ class Sightlines:
     def seen_through(self, surface: Planes, T_world_camera: Pose) -> float:
         """The share of a mapped surface that a scan taken at a pose (4, 4) looks through, of what it sees or
         looks through."""
+        return _share(*self.counts(surface, T_world_camera))
+
+    def counts(self, surface: Planes, T_world_camera: Pose) -> tuple[int, int]:
+        """How many cells of the surface it looks through, and how many it sees."""
         points = (surface.points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         ranges_m = np.linalg.norm(points, axis=1)
         counts = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
@@ -65,7 +70,7 @@ class Sightlines:
         measured = farthest_m > 0
         through = measured & (nearest_m > ranges_m + margin_m)
         met = measured & ~through & (farthest_m > ranges_m - margin_m)
-        return float(through.sum() / max(1, through.sum() + met.sum()))
+        return int(through.sum()), int(met.sum())
 
 
 def _bins(points: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -77,9 +82,24 @@ def _bins(points: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> NDArray
 
 
 def looked_through(surface: Planes, image: DepthImage, T_world_camera: Pose) -> float:
-    """The share of a mapped surface that an image taken at a pose (4, 4) looks through, of what it sees or
-    looks through. Surfaces seen at a slant do not count, nor what stands beside the edge of something
-    nearer."""
+    """The share of a mapped surface that a camera's image taken at a pose (4, 4) looks through, of what it
+    sees or looks through."""
+    return _share(*_counts_of_camera(surface, image, T_world_camera))
+
+
+def through_and_seen(surface: Planes, image: DepthImage, T_world_camera: Pose) -> tuple[int, int]:
+    """How many cells of a mapped surface an image of any sensor looks through, and how many it sees."""
+    if sees_around(image.camera):
+        return Sightlines.of(image).counts(surface, T_world_camera)
+    return _counts_of_camera(surface, image, T_world_camera)
+
+
+def _share(through: int, seen: int) -> float:
+    return through / max(1, through + seen)
+
+
+def _counts_of_camera(surface: Planes, image: DepthImage, T_world_camera: Pose) -> tuple[int, int]:
+    """Surfaces seen at a slant do not count, nor what stands beside the edge of something nearer."""
     points = (surface.points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     normals = surface.normals @ T_world_camera[:3, :3]
     facing = -(points * normals).sum(axis=1) > LEAST_FACING * np.linalg.norm(points, axis=1)
@@ -92,4 +112,4 @@ def looked_through(surface: Planes, image: DepthImage, T_world_camera: Pose) -> 
     measured = np.isfinite(nearest_m)
     through = measured & (nearest_m > seen[:, 2] + margin_m)
     met = measured & ~through & (nearest_m > seen[:, 2] - margin_m)
-    return float(through.sum() / max(1, through.sum() + met.sum()))
+    return int(through.sum()), int(met.sum())

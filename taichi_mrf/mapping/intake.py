@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
+from taichi_mrf.alignment.locate_recording import PlaceCheck
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, LostFrameError
@@ -17,6 +18,7 @@ from taichi_mrf.mapping.refinement import refiner_of
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
 from taichi_mrf.mapping.tracking import Track, keyframe_steps, tracker_of
+from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 
@@ -34,12 +36,14 @@ class UnreadableFrame:
 class Added:
     """The frame, at the pose that was found for it, is keyframe ``keyframe`` of the map, with ``rays``
     measured pixels. Its marginals are not inferred yet, unless the intake sweeps or aligns it. ``closure`` is
-    the loop that it closes, which has moved other keyframes."""
+    the loop that it closes, which has moved other keyframes. ``doubt`` says why the recording may not be
+    where it was located in an earlier map, if that shows with this keyframe."""
 
     frame: Frame
     keyframe: int
     rays: int
     closure: Closure | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,18 +97,20 @@ class Intake:
         remember_frames: bool = True,
         before_adding: Callable[[Frame], None] = lambda frame: None,
         fixed: Callable[[], Collection[int]] = lambda: (),
+        place: PlaceCheck | None = None,
     ) -> None:
         """``tracked``: the poses of frames are found by tracking. ``hold_out``: one frame in so many is held
         out. ``sweep`` is called with each new keyframe that is not aligned, which is swept anyway, so that
         the map can be looked at. ``remember_frames``: the result lists skipped frames and tracked poses,
         which grow with the run. ``before_adding`` is called with each frame that is about to be added.
-        ``fixed`` returns the ids of keyframes that no closed loop may move.
+        ``fixed`` returns the ids of keyframes that no closed loop may move. ``place`` checks where the frames
+        were located in an earlier map.
         Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
         self.map = m
         self.result = MappingResult(m)
         self.tracker = tracker_of(m, config.poses) if tracked else None
         self.refiner = refiner_of(m, config.poses, tracked)
-        self._loops = loop_closer_of(self.tracker, config.poses, fixed)
+        self._loops, self._place = loop_closer_of(self.tracker, config.poses, fixed), place
         self._aligns = config.poses.refine
         if self.tracker is not None:
             self.result.track = Track()
@@ -155,7 +161,11 @@ class Intake:
             closure = self._close_loops(keyframe)
             frame = replace(frame, T_world_camera=self.map.keyframes[keyframe].T_world_camera)
         self._selector.accept(frame.T_world_camera, frame.sensor)
-        return Added(frame, keyframe, self.map.keyframes[keyframe].rays, closure)
+        doubt = ""
+        if self._place is not None and can_refine_poses(self.map):
+            doubt = self._place.take(self.map.keyframes[keyframe].image, frame.T_world_camera)
+            self.result.doubt = self.result.doubt or doubt
+        return Added(frame, keyframe, self.map.keyframes[keyframe].rays, closure, doubt)
 
     def go_on_from(self, keyframe: int, T_recorded: Pose, sensor: str = "") -> None:
         """Go on after a keyframe of a sensor that the map of an earlier run has brought along."""

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.alignment.locate_recording import LocatedRecording, locate_any
+from taichi_mrf.alignment.locate_recording import LocatedRecording, PlaceCheck, locate_any
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.scan import Scan, scan_of
+from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.alignment.whole_map import WholeMap, map_of_voxels, walls_of
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, KeyframeConfig
@@ -28,10 +29,10 @@ from taichi_mrf.geometry.up import up_vector
 from taichi_mrf.mapping.intake import Added, Intake, Lost, Passed
 from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.methods.capabilities import can_freeze, can_refine_poses
-from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.queries.points import FREE
+from taichi_mrf.sensor.camera import sees_around
 from taichi_mrf.sensor.frame import Frame
 
 EVERYWHERE = np.full(3, np.inf)
@@ -89,12 +90,18 @@ def locate(
     if keyframes cannot be aligned in a map of this method, or if the map has none, and what reading frames
     raises.
     """
-    if not can_refine_poses(m):
-        raise ConfigError(
-            f"a recording is found in maps of the method {methods_with('can_refine_poses')}, "
-            f"not {m.METHOD.name}"
-        )
-    whole, parts = whole_map(m), _stretches(m, frames, {} if kept is None else kept, tell)
+    return _located(m, whole_map(m), frames, T_map_recording, {} if kept is None else kept, tell)
+
+
+def _located(
+    m: OccupancyMap,
+    whole: WholeMap,
+    frames: Sequence[Frame] | Dataset,
+    T_map_recording: Pose | None,
+    kept: dict[int, Frame],
+    tell: Tell,
+) -> LocatedRecording:
+    parts = _stretches(m, frames, kept, tell)
     stretches: Iterable[Scan] = (scan_of(part, m.config.sensor, m.noise) for part in parts)
     if not (isinstance(frames, Dataset) and (frames.endless or frames.tracked)):
         stretches = list(stretches)  # the others take long
@@ -102,9 +109,15 @@ def locate(
     return locate_any(stretches, whole, T_map_recording, nothing)
 
 
-def whole_map(m: MRFMap) -> WholeMap:
+def whole_map(m: OccupancyMap) -> WholeMap:
     """The surface that a map's keyframes have measured, or, if any are frozen, that of its voxels. Raises
-    ConfigError for an empty map, and for one that does not know which way is up."""
+    ConfigError for an empty map, for one that does not know which way is up, and for a method that cannot
+    align keyframes."""
+    if not can_refine_poses(m):
+        raise ConfigError(
+            f"a recording is found in maps of the method {methods_with('can_refine_poses')}, "
+            f"not {m.METHOD.name}"
+        )
     if m.up is None:
         raise ConfigError("nothing can be found in a map without keyframes that does not say which way is up")
     if m.frozen:
@@ -120,7 +133,7 @@ def whole_map(m: MRFMap) -> WholeMap:
 
 
 def _stretches(
-    m: MRFMap, frames: Sequence[Frame] | Dataset, kept: dict[int, Frame], tell: Tell
+    m: OccupancyMap, frames: Sequence[Frame] | Dataset, kept: dict[int, Frame], tell: Tell
 ) -> Iterator[list[Frame]]:
     """Stretches of a recording, from its beginning and from further on."""
     if not isinstance(frames, Dataset):
@@ -178,7 +191,7 @@ def _tells_more(part: Sequence[Frame], frame: Frame) -> bool:
     return moved_m > RULES.keyframe_m / 2 or turned_rad > RULES.keyframe_rad / 2
 
 
-def _tracked(m: MRFMap, dataset: Dataset) -> Iterator[list[Frame]]:
+def _tracked(m: OccupancyMap, dataset: Dataset) -> Iterator[list[Frame]]:
     """Keyframes of a camera that is tracked in a map of its own, in stretches."""
     intake = Intake(create_map(m.config, dataset.camera), m.config, tracked=True)
     part: list[Frame] = []
@@ -203,7 +216,9 @@ KEPT_STEPS = KeyframeConfig(rotation=RULES.keyframe_rad / 4, translation=RULES.k
 """Motion from one kept frame to the next, short enough to be tracked; one that stands still is not kept."""
 
 
-def _tracked_live(m: MRFMap, dataset: Dataset, kept: dict[int, Frame], tell: Tell) -> Iterator[list[Frame]]:
+def _tracked_live(
+    m: OccupancyMap, dataset: Dataset, kept: dict[int, Frame], tell: Tell
+) -> Iterator[list[Frame]]:
     """Keyframes of a camera that runs and is tracked, in stretches, each in a map and a world of its own:
     that of the first of its frames, which are ``kept`` as they came. None is searched for by fewer views: one
     view of a wall fits many places."""
@@ -253,7 +268,8 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda 
     its newest keyframe if their clock begins before it. ``tell`` is told what an endless one is waited for.
     Raises DatasetError if the dataset is not found in the map, which is called ``name``."""
     kept: dict[int, Frame] = {}
-    located = locate(m, dataset, kept=kept, tell=tell)
+    whole = whole_map(m)
+    located = _located(m, whole, dataset, None, kept, tell)
     if located.T_map_recording is None:
         raise DatasetError(f"{dataset.name}: not found in {name}: {located.reason}")
     notes = [*dataset.notes, f"Located in {name}: {located.in_words()}."]
@@ -274,7 +290,16 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda 
         later_s=later_s,
         map_origin_m=np.asarray(m.config.volume.origin),
         kept=kept,
+        walls=whole.walls,
+        most_through=RULES.whole_scan_through if sees_around(dataset.camera) else whole.most_through,
     )
+
+
+def place_check_of(dataset: Dataset | None) -> PlaceCheck | None:
+    """The check of where a dataset was located in an earlier map; None if it was not."""
+    if not isinstance(dataset, Placed) or dataset.walls is None:
+        return None
+    return PlaceCheck(dataset.walls, dataset.most_through)
 
 
 def freeze_all(m: OccupancyMap) -> None:
@@ -305,7 +330,8 @@ class Placed(Derived):
 
     ``prefix`` goes before their names, and ``later_s`` is added to their stamps. ``kept`` are the first
     frames of an endless source, by the index under which they were read, which was located by them. They can
-    be read again: a tracked camera begins where the first was taken.
+    be read again: a tracked camera begins where the first was taken. What is mapped may look through
+    ``most_through`` of the map's ``walls``, at most.
     """
 
     located: LocatedRecording = field(kw_only=True)
@@ -313,6 +339,8 @@ class Placed(Derived):
     later_s: float = field(kw_only=True)
     map_origin_m: NDArray[np.float64] = field(kw_only=True)
     kept: dict[int, Frame] = field(kw_only=True, default_factory=dict)
+    walls: Planes | None = field(kw_only=True, default=None)
+    most_through: float = field(kw_only=True, default=RULES.whole_through)
 
     def __post_init__(self) -> None:
         self._first = list(self.kept.values())

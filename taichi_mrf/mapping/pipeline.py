@@ -30,6 +30,7 @@ from taichi_mrf.mapping.intake import (
     UnreadableFrame,
     hold_out_of,
 )
+from taichi_mrf.mapping.onto import place_check_of
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover, RoundStep
 from taichi_mrf.mapping.settling import FullInference
@@ -133,7 +134,8 @@ class SequenceRun:
             m = create_map(config, dataset.camera) if onto is None else onto
         if map_path is not None and (window := window_of(m)) is not None:
             window.park_beside(map_path)
-        self._intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
+        hold_out, place = hold_out_of(dataset, config), place_check_of(dataset)
+        self._intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out, place=place)
         if self._intake.refiner is not None and config.poses.refine and resume_from is not None:
             self._intake.refiner.repeat(resume_from.keyframes.values())
         self._follower = follower_of(m, dataset, config.poses)

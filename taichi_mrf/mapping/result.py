@@ -23,7 +23,8 @@ class MappingResult:
     if poses were tracked, the pose of each frame, and ``loops_closed`` counts the loops. ``full`` names the
     frame that did not fit into memory and says why; the map holds those before it. ``steps``: whether depth
     and recorded poses agree, if that was checked. ``followed``: what became of poses that changed, if there
-    were any to follow. ``before`` counts the keyframes of earlier recordings that the map began with.
+    were any to follow. ``before`` counts the keyframes of earlier recordings that the map began with, and
+    ``doubt`` says why the recording may not be where it was located among them.
     """
 
     map: OccupancyMap
@@ -41,6 +42,7 @@ class MappingResult:
     steps: StepCheck | None = None
     followed: Followed | None = None
     before: int = 0
+    doubt: str = ""
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:

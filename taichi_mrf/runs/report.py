@@ -63,6 +63,7 @@ def run_report(
         "dropped_frames": 0 if dataset is None else dataset.dropped,
         "notes": [
             *([] if dataset is None else dataset.notes),
+            *([result.doubt] if result.doubt else []),
             *_pose_notes(result, check is not None),
             *_lost_notes(result.track),
             *_step_notes(result.steps),

@@ -10,6 +10,7 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
+from taichi_mrf.mapping.onto import place_check_of
 from taichi_mrf.mapping.pipeline import keyframes_in
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import (
@@ -183,6 +184,7 @@ class Run(SessionCore):
             remember_frames=self.policy.out is not None,
             before_adding=self._show_adding,
             fixed=lambda: self.mapper.placed_by_hand(),
+            place=place_check_of(source.dataset),
         )
         replay = source.new_replay() if source.new_replay else None
         if replay is not None and self.replay is not None:

@@ -220,6 +220,8 @@ class Session:
         state.send(state.mapper.describe(entry))
         if added.closure is not None:
             self._show_closed(added.closure)
+        if added.doubt:
+            state.send(Notice(added.doubt, "warning"))
         state.mapper.renew()
         if state.policy.keep_live is not None:
             for each in state.mapper.surplus(entry, state.policy.keep_live):

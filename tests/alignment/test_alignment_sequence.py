@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from inputs_frames import Frames, of_frames
+from tracked_room import coarse_frames, disturbed
 
 from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.recorded import RecordedPoses
-from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig
-from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
@@ -23,7 +21,6 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -32,28 +29,14 @@ COUNT = 8
 REFINE = Config(voxel_size=0.1, poses=PoseConfig(refine=True), evaluation=EvaluationConfig(hold_out=0))
 
 
-@cache
-def true_frames() -> list[Frame]:
-    """A third of the way round the built-in room."""
-    dataset = open_dataset("synthetic:room?width=160&height=120&frames=20", color=False)
-    return [dataset.read(i) for i in range(COUNT)]
-
-
-def disturbed(seed: int) -> list[Pose]:
-    random = np.random.default_rng(seed)
-    scale = np.repeat([0.02, np.radians(1.0)], 3)
-    true = [frame.T_world_camera for frame in true_frames()]
-    return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
-
-
 def posed(poses: Sequence[Pose]) -> Frames:
     """The room with the poses of a bad tracker."""
-    return of_frames([replace(f, T_world_camera=T) for f, T in zip(true_frames(), poses, strict=True)])
+    return of_frames([replace(f, T_world_camera=T) for f, T in zip(coarse_frames(), poses, strict=True)])
 
 
 def errors(poses: Sequence[Pose]) -> np.ndarray:
     """Mean rotation (radians) and translation (metres) off the truth; the first is no error at all."""
-    true = [frame.T_world_camera for frame in true_frames()]
+    true = [frame.T_world_camera for frame in coarse_frames()]
     each = [tangent_norms(a, b) for a, b in zip(true, poses, strict=True)]
     assert np.array_equal(poses[0], true[0])
     return np.mean(each[1:], axis=0)
@@ -66,9 +49,9 @@ def recorded(poses: dict[int, Pose], config: PoseConfig | None = None) -> Record
 def test_all_at_once_takes_back_more_than_half() -> None:
     points = {
         i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
-        for i, f in enumerate(true_frames())
+        for i, f in enumerate(coarse_frames())
     }
-    start = dict(enumerate(disturbed(0)))
+    start = dict(enumerate(disturbed(COUNT, 0)))
     found = driven(align_jointly(points, start, recorded(start)))
     before, after = errors(list(start.values())), errors(list(found.values()))
     assert (after < 0.5 * before).all()
@@ -77,9 +60,9 @@ def test_all_at_once_takes_back_more_than_half() -> None:
 def test_poses_recorded_well_are_trusted() -> None:
     points = {
         i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
-        for i, f in enumerate(true_frames()[:3])
+        for i, f in enumerate(coarse_frames()[:3])
     }
-    start = dict(enumerate(disturbed(0)[:3]))
+    start = dict(enumerate(disturbed(COUNT, 0)[:3]))
     sure = PoseConfig(translation_sigma=1e-5, rotation_sigma=1e-5)
     found = driven(align_jointly(points, start, recorded(start, sure)))
     for id, T in found.items():
@@ -87,7 +70,7 @@ def test_poses_recorded_well_are_trusted() -> None:
 
 
 def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
-    frames = [true_frames()[i] for i in (0, 1)]
+    frames = [coarse_frames()[i] for i in (0, 1)]
     points = {
         i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
         for i, f in enumerate(frames)
@@ -100,10 +83,10 @@ def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
 
 def test_the_pipeline_corrects_poses_and_tells_both() -> None:
     events: list[Event] = []
-    wrong = disturbed(1)
+    wrong = disturbed(COUNT, 1)
     result = map_sequence(posed(wrong), REFINE, events.append)
     assert isinstance(result.map, MRFMap)
-    assert [change.name for change in result.poses] == [frame.name for frame in true_frames()]
+    assert [change.name for change in result.poses] == [frame.name for frame in coarse_frames()]
     for change, T_recorded in zip(result.poses, wrong, strict=True):
         np.testing.assert_array_equal(change.T_recorded, T_recorded)
         np.testing.assert_array_equal(change.T_refined, result.map.keyframes[change.keyframe].T_world_camera)
@@ -119,7 +102,7 @@ def test_the_pipeline_corrects_poses_and_tells_both() -> None:
     assert asked == [(round, rounds.MOST_ROUNDS, number, COUNT) for round, number in steps]
     # The map is that of the refined poses, whatever was done on the way.
     again = MRFMap.from_config(result.map.config, result.map.keyframes[0].camera)
-    for frame, T in zip(true_frames(), refined, strict=True):
+    for frame, T in zip(coarse_frames(), refined, strict=True):
         again.add_keyframe(frame.depth_m, T, frame.camera)
     again.infer()
     centres, _ = again.voxels(min_probability=0.0)
@@ -127,7 +110,7 @@ def test_the_pipeline_corrects_poses_and_tells_both() -> None:
 
 
 def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> None:
-    wrong = disturbed(2)
+    wrong = disturbed(COUNT, 2)
     left = [3]
 
     def listen(event: Event) -> None:
@@ -144,7 +127,7 @@ def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> Non
 
 
 def test_a_stop_in_the_rounds_undoes_the_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = disturbed(1)
+    wrong = disturbed(COUNT, 1)
     told: list[Event] = []
 
     def stop() -> bool:
@@ -160,7 +143,7 @@ def test_a_stop_in_the_rounds_undoes_the_round(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_without_it_nothing_is_moved() -> None:
-    wrong = disturbed(1)
+    wrong = disturbed(COUNT, 1)
     result = map_sequence(posed(wrong), replace(REFINE, poses=PoseConfig()), limit=2)
     assert result.poses == []
     for keyframe, T in zip(result.map.keyframes.values(), wrong, strict=False):
@@ -169,4 +152,4 @@ def test_without_it_nothing_is_moved() -> None:
 
 def test_only_mrf_maps_can_move_keyframes() -> None:
     with pytest.raises(ConfigError, match=r"poses.refine needs the method mrf"):
-        map_sequence(posed(disturbed(1)), replace(REFINE, method="log_odds"))
+        map_sequence(posed(disturbed(COUNT, 1)), replace(REFINE, method="log_odds"))

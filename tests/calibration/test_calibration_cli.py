@@ -1,16 +1,16 @@
 """``taichi-mrf calibrate`` as a person runs it: a process, its files, its words, its exit status."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from calibration_boards import BOARD_FLAGS, CAMERA_TEXT, captured, write_poses, write_recording
+from calibration_boards import BOARD_FLAGS, CAMERA_TEXT, captured, write_recording
 from calibration_scenes import CAMERA, Planes, Tables, random_tables
-from console import assert_refused, complaints, taichi_mrf
+from console import assert_refused, complaints, report_of, taichi_mrf
+from datasets_recordings import write_stamped
 from numpy.polynomial.polynomial import polyval
 
 from taichi_mrf.cli.main import main
@@ -30,10 +30,6 @@ BOARD_OPTIONS = (
     *BOARD_FLAGS, "--patch", str(BOARD_PATCH), "--max-depth", "3", "--least-count", "500", "--no-pictures",
 )  # fmt: skip
 """With fewer than some hundred samples a bin, chance alone would move bias by a millimetre."""
-
-
-def report_of(out: Path) -> dict:
-    return json.loads((out / "report.json").read_text(encoding="utf-8"))
 
 
 def calibrated(*arguments: str | Path) -> str:
@@ -100,8 +96,8 @@ def board_recording(tmp_path_factory: pytest.TempPathFactory, board_tables: Tabl
     folder = tmp_path_factory.mktemp("board") / "recording"
     write_recording(folder, np.arange(90) / 10.3, board_tables)
     capture = captured(LAG, 9.0, np.random.default_rng(5), noise=5e-5)
-    write_poses(folder / "camera_poses.txt", capture.camera)
-    write_poses(folder / "board_poses.txt", capture.board)
+    write_stamped(folder / "camera_poses.txt", capture.camera.stamps, capture.camera.poses)
+    write_stamped(folder / "board_poses.txt", capture.board.stamps, capture.board.poses)
     return folder
 
 

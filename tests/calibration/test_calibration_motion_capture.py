@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_boards import BOARD, CAMERA, board_motion, captured, ideal_view, write_poses
+from calibration_boards import BOARD, CAMERA, board_motion, captured, ideal_view
+from datasets_recordings import write_stamped
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -145,7 +146,7 @@ def test_nothing_is_interpolated_over_gaps_or_beyond_the_ends() -> None:
 
 def test_streams_are_read_back_whatever_their_order_and_separator(tmp_path: Path) -> None:
     stream = captured(0.0, 0.2, np.random.default_rng(0)).board
-    write_poses(tmp_path / "board.csv", stream)
+    write_stamped(tmp_path / "board.csv", stream.stamps, stream.poses)
     lines = (tmp_path / "board.csv").read_text().splitlines()
     (tmp_path / "board.csv").write_text("\n".join(line.replace(" ", ",") for line in reversed(lines)))
     read = read_timed_poses(tmp_path / "board.csv")

@@ -1,7 +1,6 @@
 """``taichi-mrf laser`` as a person runs it: files that other tools open, one line for what is wrong."""
 
 import csv
-import json
 import signal
 import subprocess
 from pathlib import Path
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from console import complaints, signalled, taichi_mrf
+from console import complaints, report_of, signalled, taichi_mrf
 from laser_logs import flaser
 
 from taichi_mrf.cli.main import BAD_INPUT, main
@@ -47,10 +46,6 @@ def mapped(*arguments: str | Path) -> str:
 
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
-
-
-def report_of(out: Path) -> dict:
-    return json.loads((out / "report.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from armed_room import HALF_M, ArmedRoom, T_camera_bar, missed_m, record, to_bar_m
-from armed_urdf import write_urdf
+from armed_room import HALF_M, ArmedRoom, T_camera_bar, missed_m, record, to_bar_m, write_urdf
 from console import FAST, as_process, assert_refused, taichi_mrf
 from datasets_recordings import write_image
 from scipy.spatial import cKDTree

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armed_room import HALF_M, bar_depth_m, missed_m, to_bar_m
-from armed_urdf import write_urdf
+from armed_room import HALF_M, bar_depth_m, missed_m, to_bar_m, write_urdf
 from datasets_recordings import Content, write_seven_scenes
 from refusals import bad_frame, refused
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from one_pixel import ONE_PIXEL, VOXEL, ExactMap, allocated, image, look_along, marginals, well_cut
+from one_pixel import VOXEL, crossing, marginals
 from oracles import inference as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.factor_graph.beams import BrickCells
@@ -17,34 +16,12 @@ from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.solve import solve
 from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
 
 seeds = st.integers(0, 2**32 - 1)
 shallow = st.floats(0.3, 0.7)
 CONVERGED = {"iterations": 60, "damping": 0.0, "tolerance": 0.0, "schedule": "parallel", "polish": 0}
-
-
-def crossing(
-    seed: int, depths: tuple[float, ...], sigma: float, prior: float
-) -> tuple[MRFMap, list[reference.Ray], InferenceConfig]:
-    """Keyframes of one ray each, which meet in one voxel, and the rays of the oracle."""
-    rng = np.random.default_rng(seed)
-    shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
-    config = InferenceConfig(prior=prior, free_share=0.0)
-    poses, rays = [], []
-    for depth in depths:
-        direction = rng.normal(size=3)
-        direction /= np.linalg.norm(direction)
-        poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
-        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, Noise((sigma,)), max_depth=0.4)
-    assume(well_cut(rays, 9))
-    m = ExactMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
-    for depth, T in zip(depths, poses, strict=True):
-        m.add_keyframe(image(depth), T, ONE_PIXEL)
-    assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
-    return m, rays, config
 
 
 def at_voxels(graph: FactorGraph, values: np.ndarray, voxels: list[reference.Voxel]) -> np.ndarray:

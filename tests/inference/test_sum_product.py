@@ -12,6 +12,7 @@ from one_pixel import (
     ExactMapWithLengths,
     FineMap,
     allocated,
+    crossing,
     image,
     look_along,
     marginals,
@@ -78,21 +79,8 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
     sigma: float,
     prior: float,
 ) -> None:
-    rng = np.random.default_rng(seed)
-    shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
-    sensor, config = Noise((sigma,)), InferenceConfig(prior=prior, free_share=0.0)
-    poses, rays = [], []
-    for depth in depths:
-        direction = rng.normal(size=3)
-        direction /= np.linalg.norm(direction)
-        poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
-        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, sensor, max_depth=0.4)
-    common = {s.voxel for s in rays[0].segments} & {s.voxel for s in rays[1].segments}
-    assume(len(common) == 1 and well_cut(rays, 9))
-    m = ExactMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
-    for depth, T in zip(depths, poses, strict=True):
-        m.add_keyframe(image(depth), T, ONE_PIXEL)
-    assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
+    m, rays, config = crossing(seed, depths, sigma, prior)
+    assume(len({s.voxel for s in rays[0].segments} & {s.voxel for s in rays[1].segments}) == 1)
     m.infer(sweeps=6)
     exact = reference.enumerate_marginals(rays, prior, config.floor)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sliding_camera import ALL_FRAMES, StopAfter, names, sequence
+from small_room import assert_same_voxels
 
 from taichi_mrf.config.schema import Config, PoseConfig
 from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses, WatchedFile, open_pose_source
@@ -80,13 +81,6 @@ def anew(poses: dict[int, Pose], config: Config = ALL_FRAMES) -> OccupancyMap:
     return m
 
 
-def assert_same_map(m: OccupancyMap, other: OccupancyMap) -> None:
-    (centres, p), (others, q) = m.voxels(0.0), other.voxels(0.0)
-    order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
-    np.testing.assert_array_equal(centres[order], others[other_order])
-    np.testing.assert_array_equal(p[order], q[other_order])
-
-
 offsets = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
 some_poses = st.dictionaries(st.integers(0, 5), offsets, max_size=4)
 
@@ -101,7 +95,7 @@ def test_the_map_is_that_made_anew_with_the_last_poses(versions: list[dict | Non
             continue
         last |= {index: shifted(index, *offset) for index, offset in version.items()}
         told.append({f"frame {index}": T for index, T in last.items()})
-    assert_same_map(followed([*told, {f"frame {i}": T for i, T in last.items()}]), anew(last))
+    assert_same_voxels(followed([*told, {f"frame {i}": T for i, T in last.items()}]), anew(last))
 
 
 def test_keyframes_that_are_not_named_are_carried() -> None:
@@ -112,7 +106,7 @@ def test_keyframes_that_are_not_named_are_carried() -> None:
     places = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
     for index, T in enumerate(places):
         np.testing.assert_allclose(T, shifted(index, 0.0, 0.2) if index else shifted(0), atol=1e-12)
-    assert_same_map(m, anew(dict(enumerate(places))))
+    assert_same_voxels(m, anew(dict(enumerate(places))))
 
 
 @pytest.mark.parametrize("method", ["log_odds", "visibility"])
@@ -120,7 +114,7 @@ def test_every_method_follows(method: str) -> None:
     config = replace(ALL_FRAMES, method=method)
     last = {2: shifted(2, 0.2, 0.0, 0.1), 4: shifted(4, 0.0, 0.1, 0.0)}
     versions = [{2: shifted(2, 0.1, 0.0, 0.0)}, None, last]
-    assert_same_map(followed(versions, config), anew(last, config))
+    assert_same_voxels(followed(versions, config), anew(last, config))
 
 
 def test_keyframes_move_between_frames_and_new_frames_come_at_the_new_poses() -> None:
@@ -157,7 +151,7 @@ def test_a_run_waits_for_a_file_that_still_changes(tmp_path: Path, monkeypatch: 
 
     dataset = posed_by(sequence(), open_pose_source(path), follow=True)  # which is not there yet
     m = map_sequence(dataset, ALL_FRAMES, listen).map
-    assert_same_map(m, anew(last))
+    assert_same_voxels(m, anew(last))
     assert max(told) <= 0.3
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from inputs_frames import Frames
+from small_room import assert_same_voxels
 from two_days import CONFIG, COUNT, STOOL, TODAY, YESTERDAY, recorded, turned_away
 
 import taichi_mrf as tm
@@ -20,6 +21,7 @@ from taichi_mrf.mapping.onto import Placed, freeze_all, locate, parameters_onto,
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.runs.report import run_report
 from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -49,10 +51,8 @@ def where_it_is(dataset: Frames, m: MRFMap) -> Placed:
 
 
 def assert_same_map(a: MRFMap, b: MRFMap) -> None:
-    (centres, p), (others, q) = (m.marginals.voxels(min_probability=0.0) for m in (a, b))
-    order, other = np.lexsort(centres.T), np.lexsort(others.T)
-    np.testing.assert_array_equal(centres[order], others[other])
-    np.testing.assert_array_equal(p[order], q[other])
+    assert_same_voxels(a.marginals, b.marginals)
+    centres, _ = a.marginals.voxels(min_probability=0.0)
     np.testing.assert_array_equal(a.state(centres), b.state(centres))
 
 
@@ -145,6 +145,29 @@ def test_a_mirror_image_of_which_some_views_fit_is_refused_by_the_others() -> No
     assert found.T_map_recording is None
     assert found.reason.startswith("another place: ")
     assert locate(m, recorded(range(1, around, 2), turned_away(), around=around)).T_map_recording is not None
+
+
+class Running(Frames):
+    """Frames that cannot be looked at before they are mapped, such as a robot's."""
+
+    @property
+    def endless(self) -> bool:
+        return True
+
+
+def test_a_run_that_was_located_in_a_mirror_image_is_doubted_by_what_it_maps(tmp_path: Path) -> None:
+    """Only its first views are searched for, and they fit; those after them do not."""
+    around, path = 120, tmp_path / "map.npz"
+    map_sequence(recorded(range(0, around, 2), around=around), CONFIG).map.save(path)
+    here = recorded(range(1, around, 2), turned_away(), around=around)
+    for walk, is_wrong in ((mirrored(here), True), (here, False)):
+        m = tm.load_map(path)
+        stretches = (walk.frames[first:] for first in range(0, 30, 10))
+        frames = next(each for each in stretches if locate(m, each[:10]).T_map_recording is not None)
+        running = Running("the room", walk.camera, frames=frames)
+        result = map_sequence(placed_in(m, "yesterday", running), CONFIG, onto=m, limit=30)
+        assert result.doubt.startswith("the recording may have been located in a wrong place") == is_wrong
+        assert (result.doubt in run_report(result, running, "", None)["notes"]) == is_wrong
 
 
 def test_a_tracked_recording_is_found_by_its_own_small_map(saved: Path) -> None:

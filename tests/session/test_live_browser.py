@@ -4,30 +4,21 @@ import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 import pytest
-from browser import LivePage, Seen, chromium, missing
+from browser import Browser, LivePage, Seen, missing
 from live_program import LiveProgram
 
 from taichi_mrf import OCCUPIED, MRFMap
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
-
 ROOM = "synthetic:room?frames=6&width=96&height=72"
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +28,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def program(out: Path, browser: "Browser") -> Iterator[LiveProgram]:
+def program(out: Path, browser: Browser) -> Iterator[LiveProgram]:
     """The room at a twentieth of its pace: one frame in four seconds, which a busy machine can draw. It
     begins when Chromium is there to see it."""
     options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05", "--out", out)
@@ -46,7 +37,7 @@ def program(out: Path, browser: "Browser") -> Iterator[LiveProgram]:
 
 
 @pytest.fixture(scope="module")
-def late_page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
+def late_page(program: LiveProgram, browser: Browser) -> Iterator[LivePage]:
     """A page that was loaded when the map was complete. Whoever asks for it first sees the map grow."""
     with LivePage(browser, program.address) as opened:
         opened.until_settled()
@@ -77,7 +68,7 @@ def voxels_of(m: MRFMap, probability: float) -> int:
     return len(m.decided.voxels(probability)[0])
 
 
-def test_voxels_appear_as_keyframes_arrive(program: LiveProgram, browser: "Browser") -> None:
+def test_voxels_appear_as_keyframes_arrive(program: LiveProgram, browser: Browser) -> None:
     equal_counts, keyframes = set(), set()
     with LivePage(browser, program.address) as page:
 
@@ -404,7 +395,7 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
 
-def test_a_map_with_colours_has_a_baseline_without(browser: "Browser") -> None:
+def test_a_map_with_colours_has_a_baseline_without(browser: Browser) -> None:
     with (
         LiveProgram(
             ROOM, "--color", "--limit", "3", "--voxel-size", "8cm", "--runtime.arch", "cpu"
@@ -419,7 +410,7 @@ def test_a_map_with_colours_has_a_baseline_without(browser: "Browser") -> None:
 
 
 def test_a_link_begins_with_the_view_that_it_was_made_of(
-    page: LivePage, program: LiveProgram, browser: "Browser"
+    page: LivePage, program: LiveProgram, browser: Browser
 ) -> None:
     first = page.position()
     page.page.mouse.move(400, 600)
@@ -451,7 +442,7 @@ def test_a_link_begins_with_the_view_that_it_was_made_of(
 
 
 def test_two_viewers_in_a_wide_and_a_narrow_window(
-    page: LivePage, program: LiveProgram, browser: "Browser"
+    page: LivePage, program: LiveProgram, browser: Browser
 ) -> None:
     before = page.look()
     with LivePage(browser, program.address, width=400, height=700) as narrow:
@@ -490,7 +481,7 @@ CUT_OFF = """() => [...document.querySelectorAll("button, label, p, td, [role=ta
     [(1280, 800, "dark"), (1920, 1080, "light"), (390, 844, "light"), (390, 844, "dark")],
 )
 def test_nothing_is_cut_off(
-    program: LiveProgram, browser: "Browser", width: int, height: int, scheme: Literal["dark", "light"]
+    program: LiveProgram, browser: Browser, width: int, height: int, scheme: Literal["dark", "light"]
 ) -> None:
     with LivePage(browser, program.address, width, height) as page:
         page.page.emulate_media(color_scheme=scheme)
@@ -610,7 +601,7 @@ def test_the_view_follows_the_camera(page: LivePage) -> None:
 
 
 def test_a_signal_ends_it_while_a_page_watches_and_keeps_what_is_mapped(
-    program: LiveProgram, browser: "Browser", out: Path
+    program: LiveProgram, browser: Browser, out: Path
 ) -> None:
     with LivePage(browser, program.address) as page:
         page.until_settled()  # so that few keyframes are those of the new map

@@ -7,7 +7,6 @@ import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import msgspec
@@ -15,13 +14,10 @@ import numpy as np
 import pytest
 import trimesh
 import zstandard
-from browser import LivePage, Seen, chromium, missing
+from browser import Browser, LivePage, Seen, missing
 from live_program import LiveProgram
 
 from taichi_mrf import MRFMap
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
 
 ROOM = "synthetic:room?frames=6&width=96&height=72"
 KEYFRAME, NAME = 2, "room-0002"
@@ -31,19 +27,13 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the run."""
     return tmp_path_factory.mktemp("out")
 
 
 @pytest.fixture(scope="module")
-def program(out: Path, browser: "Browser") -> Iterator[LiveProgram]:
+def program(out: Path, browser: Browser) -> Iterator[LiveProgram]:
     """The room at a fiftieth of its pace, which leaves 40 s to open a page and press a button; Chromium is
     there before it begins."""
     options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.02", "--out", out)
@@ -52,7 +42,7 @@ def program(out: Path, browser: "Browser") -> Iterator[LiveProgram]:
 
 
 @pytest.fixture(scope="module")
-def opened_page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
+def opened_page(program: LiveProgram, browser: Browser) -> Iterator[LivePage]:
     with LivePage(browser, program.address) as opened:
         yield opened
 
@@ -285,7 +275,7 @@ def test_the_picture_shows_the_map(page: LivePage, tmp_path: Path) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", tmp_path: Path) -> None:
+def test_the_standalone_page_shows_the_map(page: LivePage, browser: Browser, tmp_path: Path) -> None:
     page.tab("Save")
     page.download("Page (.html)").save_as(tmp_path / "map.html")
     with LivePage(browser, (tmp_path / "map.html").as_uri()) as standalone:

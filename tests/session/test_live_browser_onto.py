@@ -1,19 +1,14 @@
 """A live run that goes on in the map of an earlier day, in a real Chromium: the page tells the days apart."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-from browser import LivePage, chromium, missing
+from browser import Browser, LivePage, missing
 from live_program import LiveProgram
 
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.mapping.pipeline import map_sequence
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
 
 YESTERDAY, TODAY = 12, 11
 ROOM = "synthetic:room?frames={}&width=160&height=120"
@@ -47,14 +42,8 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
-
-
 def test_the_page_says_how_surely_it_is_located_and_shows_the_days_apart(
-    browser: "Browser", tmp_path: Path
+    browser: Browser, tmp_path: Path
 ) -> None:
     map_sequence(open_dataset(ROOM.format(YESTERDAY), color=False), CONFIG).map.save(tmp_path / "map.npz")
     options = ("--onto", tmp_path / "map.npz", "--runtime.arch", "cpu")

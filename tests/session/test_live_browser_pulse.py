@@ -7,18 +7,14 @@ import os
 import signal
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import pytest
-from browser import LivePage, chromium, missing
+from browser import Browser, LivePage, missing
 from live_program import LiveProgram, wait_for, with_shortest_life
 
 from taichi_mrf.viewer.transport import server as viewer_server
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.transport.viser_internals import connections
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
 
 ARGUMENTS = ("synthetic:room?frames=6&width=96&height=72", "--voxel-size", "0.1", "--runtime.arch", "cpu")
 
@@ -42,12 +38,6 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
 def program() -> Iterator[LiveProgram]:
     """One that starts each viewer again, however young. Its port is none of those that the system gives away,
     or another program could be given it while nobody listens."""
@@ -57,7 +47,7 @@ def program() -> Iterator[LiveProgram]:
 
 
 @pytest.fixture(scope="module")
-def page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
+def page(program: LiveProgram, browser: Browser) -> Iterator[LivePage]:
     """A page that never has the focus."""
     with LivePage(browser, program.address, script=WITHOUT_FOCUS) as opened:
         opened.until_settled()
@@ -149,7 +139,7 @@ def test_a_server_that_is_killed_and_restarted_is_found_again(program: LiveProgr
 
 
 def test_a_page_whose_socket_does_not_come_back_reloads(
-    browser: "Browser", monkeypatch: pytest.MonkeyPatch
+    browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = start_server("127.0.0.1", 0, "Full")
     try:

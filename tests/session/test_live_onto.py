@@ -33,7 +33,17 @@ from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy
 from taichi_mrf.session.source import Source, open_source
-from taichi_mrf.viewer.messages import Hello, KeyframeInfo, Request, Reset, Status, Switch, Undo, Update
+from taichi_mrf.viewer.messages import (
+    Hello,
+    KeyframeInfo,
+    Notice,
+    Request,
+    Reset,
+    Status,
+    Switch,
+    Undo,
+    Update,
+)
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -115,6 +125,18 @@ def test_the_map_is_that_of_a_batch_run_and_the_page_tells_the_days_apart(days: 
         assert np.linalg.norm(off[:3, 3]) < 0.05
     assert_shown_is(session, link)
     assert link.errors() == []
+
+
+def test_the_page_tells_once_that_what_is_mapped_does_not_fit_the_place(days: Days) -> None:
+    link = FakeLink()
+    source, _ = opened(days)
+    assert isinstance(source.dataset, Placed)
+    source.dataset.most_through = -1.0
+    session = Session(source, link, Policy(leave_when_done=True))
+    finished(session)
+    (doubt,) = [notice.text for notice in link.of_type(Notice) if "wrong place" in notice.text]
+    assert "its first 10 keyframes" in doubt
+    assert session.state.result().doubt == doubt
 
 
 def test_the_earlier_map_is_shown_and_inferred_before_frames_join_it(days: Days) -> None:

@@ -1,7 +1,6 @@
 """Live runs whose poses are refined, or found: what becomes of the keyframes, the map, and the page."""
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +19,14 @@ from live_scene import (
     shown,
     source,
 )
-from tracked_room import errors, nowhere, walk
+from tracked_room import coarse_frames, disturbed, errors, nowhere, walk
 
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.shared import PoseFlags
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
@@ -37,7 +36,6 @@ from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.runs.files import TRAJECTORY_FILE
 from taichi_mrf.runs.folder import write_run
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy
@@ -59,30 +57,16 @@ COUNT = 6
 REFINE = Config(voxel_size=0.1, poses=PoseConfig(refine=True), evaluation=EvaluationConfig(hold_out=0))
 
 
-@cache
-def true_frames() -> list[Frame]:
-    dataset = open_dataset("synthetic:room?width=160&height=120&frames=20", color=False)
-    return [dataset.read(i) for i in range(COUNT)]
-
-
-@cache
-def wrong_poses() -> list[Pose]:
-    """All but the first off by 2 cm and a degree along and about each axis."""
-    random = np.random.default_rng(3)
-    scale = np.repeat([0.02, np.radians(1.0)], 3)
-    true = [frame.T_world_camera for frame in true_frames()]
-    return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
-
-
 def wrong() -> Frames:
-    pairs = zip(true_frames(), wrong_poses(), strict=True)
+    pairs = zip(coarse_frames()[:COUNT], disturbed(COUNT, 3), strict=True)
     return of_frames([replace(frame, T_world_camera=T) for frame, T in pairs])
 
 
 def off(poses: list[Pose]) -> np.ndarray:
     """Mean radians and metres off the truth."""
     return np.mean(
-        [tangent_norms(f.T_world_camera, T) for f, T in zip(true_frames(), poses, strict=True)], axis=0
+        [tangent_norms(f.T_world_camera, T) for f, T in zip(coarse_frames()[:COUNT], poses, strict=True)],
+        axis=0,
     )
 
 
@@ -92,9 +76,9 @@ def told_poses(link: FakeLink) -> dict[int, Pose]:
 
 def assert_is_the_map_of_its_poses(session: Session, link: FakeLink, ids: list[int]) -> None:
     """The map is that of the frames at the poses that the page was told of, bit for bit."""
-    again = MRFMap.from_config(session.state.source.config, true_frames()[0].camera)
+    again = MRFMap.from_config(session.state.source.config, coarse_frames()[0].camera)
     for id in ids:
-        frame = true_frames()[id % COUNT]
+        frame = coarse_frames()[id % COUNT]
         again.add_keyframe(frame.depth_m, told_poses(link)[id], frame.camera)
     again.infer()
     assert marginals(session.state.mapper.map) == marginals(again)
@@ -110,8 +94,8 @@ def test_keyframes_are_aligned_as_they_come_and_together_at_the_end() -> None:
     for keyframe in link.of_type(KeyframeInfo):
         first.setdefault(keyframe.id, keyframe.T_world_camera)
     came, ended = list(first.values()), list(told_poses(link).values())
-    assert (off(came) < 0.7 * off(wrong_poses())).all()
-    assert (off(ended) < 0.5 * off(wrong_poses())).all()
+    assert (off(came) < 0.7 * off(disturbed(COUNT, 3))).all()
+    assert (off(ended) < 0.5 * off(disturbed(COUNT, 3))).all()
     assert any(not np.array_equal(a, b) for a, b in zip(came, ended, strict=True)), "no round was made"
     assert_is_the_map_of_its_poses(session, link, list(range(COUNT)))
     activities = [status.activity for status in link.of_type(Status)]
@@ -134,7 +118,7 @@ def test_live_places_keyframes_as_map_does(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_an_edit_in_the_rounds_is_carried_out_at_once_and_they_begin_anew() -> None:
-    T = moved(wrong_poses()[3], [0.3, 0, 0, 0, 0, 0])
+    T = moved(disturbed(COUNT, 3)[3], [0.3, 0, 0, 0, 0, 0])
     link = FakeLink(asking("aligning all keyframes", Move(3, T)))
     session = session_of(link, wrong(), REFINE)
     finished(session)
@@ -188,7 +172,7 @@ def test_frozen_keyframes_stay_and_the_others_are_aligned_with_them() -> None:
     assert link.errors() == []
     states = [keyframe.state for keyframe in shown(link.sent).keyframes.values()]
     assert states == ["frozen"] * (COUNT - 2) + ["on"] * 2
-    assert (off(list(told_poses(link).values())) < 0.8 * off(wrong_poses())).all()
+    assert (off(list(told_poses(link).values())) < 0.8 * off(disturbed(COUNT, 3))).all()
 
 
 def test_only_mrf_maps_can_refine() -> None:

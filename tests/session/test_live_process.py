@@ -1,26 +1,15 @@
 """The live program with a real Chromium at its page: a broken frame, and a slider while it infers."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
-from browser import LivePage, chromium, missing
+from browser import Browser, LivePage, missing
 from live_program import LiveProgram
 from slider_latency import slider_answers
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
-
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
 
 
 def recording_with_a_broken_frame(folder: Path) -> None:
@@ -33,7 +22,7 @@ def recording_with_a_broken_frame(folder: Path) -> None:
     (folder / "frame-000001.depth.png").write_bytes(b"no image")
 
 
-def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: "Browser", tmp_path: Path) -> None:
+def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: Browser, tmp_path: Path) -> None:
     recording_with_a_broken_frame(tmp_path)
     with (
         LiveProgram(tmp_path, "--voxel-size", "0.1", "--runtime.arch", "cpu") as program,
@@ -53,7 +42,7 @@ def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: "Browser", tmp_p
         assert page.problems == []
 
 
-def test_a_slider_is_answered_while_the_map_is_inferred(browser: "Browser") -> None:
+def test_a_slider_is_answered_while_the_map_is_inferred(browser: Browser) -> None:
     options = ("--voxel-size", "0.02", "--runtime.arch", "cpu", "--speed", "0.01")
     with (
         LiveProgram("synthetic:room?frames=8", *options) as program,

@@ -45,36 +45,20 @@ def send(
     for name, values in columns.items():
         kind = values.dtype.str[1:]
         formats[name] = order + kind, offset
-        fields.append(
-            bag.message("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=KINDS[kind], count=1)
-        )
+        field = {"name": name, "offset": offset, "datatype": KINDS[kind], "count": 1}
+        fields.append(bag.message("sensor_msgs/msg/PointField", **field))
         offset += int(kind[1])
-    dtype = np.dtype(
-        {
-            "names": list(formats),
-            "formats": [kind for kind, _ in formats.values()],
-            "offsets": [place for _, place in formats.values()],
-            "itemsize": offset + 3,
-        }
-    )
+    kinds, places = zip(*formats.values(), strict=True)
+    dtype = np.dtype({"names": [*formats], "formats": kinds, "offsets": places, "itemsize": offset + 3})
     rows = np.zeros((height, width), dtype)
     for name, values in columns.items():
         rows[name] = values
     data = np.pad(rows.view(np.uint8).reshape(height, -1), ((0, 0), (0, 5)))
     bag.send(
-        topic,
-        "sensor_msgs/msg/PointCloud2",
-        at,
-        header=bag.header(at, frame),
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=big,
-        point_step=dtype.itemsize,
-        row_step=data.shape[1],
+        topic, "sensor_msgs/msg/PointCloud2", at, header=bag.header(at, frame), height=height, width=width,
+        fields=fields, is_bigendian=big, point_step=dtype.itemsize, row_step=data.shape[1],
         data=data.reshape(-1),
-        is_dense=False,
-    )
+    )  # fmt: skip
 
 
 def drive(bag: Bag) -> None:

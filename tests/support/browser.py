@@ -20,6 +20,8 @@ from taichi_mrf.system import runtime
 
 if TYPE_CHECKING:  # an extra that only these tests need
     from playwright.sync_api import Browser, Download, Locator
+else:
+    Browser = Any
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "test-artifacts"
 """Folder of screenshots; git ignores it."""

@@ -128,15 +128,3 @@ def write_recording(
             cv2.imwrite(str(folder / "ir" / f"{number:04d}.png"), np.clip(image, 0, 255).astype(np.uint8))
         lines.append(f"{stamp:.6f} depth/{number:04d}.npy")
     (folder / "stamps.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def write_poses(path: Path, stream: TimedPoses) -> None:
-    """``stamp tx ty tz qx qy qz qw`` lines."""
-    lines = []
-    for stamp, T in zip(stream.stamps, stream.poses, strict=True):
-        turn = cv2.Rodrigues(T[:3, :3])[0].ravel()
-        angle = float(np.linalg.norm(turn))
-        axis = turn / max(angle, 1e-12)
-        values = [stamp, *T[:3, 3], *(axis * np.sin(angle / 2)), np.cos(angle / 2)]
-        lines.append(" ".join(f"{value:.9f}" for value in values))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -47,20 +47,14 @@ class Robot:
         self.messages: list[tuple[str, int, bytes]] = []
         self.channels: dict[str, Any] = {}
         with AnyReader([self.bag]) as reader:
+            kind, encoding = ("ros2msg", "cdr") if reader.is2 else ("ros1msg", "ros1")
             for each in reader.connections:
+                name = each.msgtype if reader.is2 else each.msgtype.replace("/msg/", "/")
+                schema = foxglove.Schema(name=name, encoding=kind, data=each.msgdef.data.encode())
                 if self.own:
                     schema = own_schema(each.msgtype, self.own)
-                    self.channels[each.topic] = foxglove.Channel(
-                        each.topic, schema=schema, message_encoding=self.own, context=self.context
-                    )
-                    continue
-                name, text = each.msgtype, each.msgdef.data.encode()
-                if not reader.is2:
-                    name = name.replace("/msg/", "/")
-                kind, encoding = ("ros2msg", "cdr") if reader.is2 else ("ros1msg", "ros1")
-                schema = foxglove.Schema(name=name, encoding=kind, data=text)
                 self.channels[each.topic] = foxglove.Channel(
-                    each.topic, schema=schema, message_encoding=encoding, context=self.context
+                    each.topic, schema=schema, message_encoding=self.own or encoding, context=self.context
                 )
             for each, time, data in reader.messages():
                 if self.own:
@@ -131,8 +125,11 @@ OWN = {
 }
 """Foxglove's own types in the place of those of ROS."""
 
-PACKED = {1: "Int8", 2: "Uint8", 3: "Int16", 4: "Uint16", 5: "Int32", 6: "Uint32", 7: "Float32", 8: "Float64"}
-"""Names of the numbers of PointField."""
+NUMBERS = {
+    1: (2, "Int8"), 2: (1, "Uint8"), 3: (4, "Int16"), 4: (3, "Uint16"),
+    5: (6, "Int32"), 6: (5, "Uint32"), 7: (7, "Float32"), 8: (8, "Float64"),
+}  # fmt: skip
+"""PackedElementField's numbers of types and their names, by the numbers of PointField."""
 
 
 def own_schema(msgtype: str, encoding: str) -> foxglove.Schema:
@@ -154,13 +151,8 @@ def made(name: str, /, **parts: Any) -> Any:
     if name == "Timestamp":
         return m.Timestamp(parts["sec"], parts["nsec"])
     if name == "PackedElementField":
-        kinds = m.PackedElementFieldNumericType
-        parts["type"] = getattr(kinds, next(PACKED[n] for n, own in NUMBERS.items() if own == parts["type"]))
+        parts["type"] = getattr(m.PackedElementFieldNumericType, dict(NUMBERS.values())[parts["type"]])
     return getattr(m, name)(**parts)
-
-
-NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
-"""PackedElementField's numbers of types, by those of PointField."""
 
 
 def fields(message: Any, msgtype: str, make: Callable[..., Any]) -> dict[str, Any]:
@@ -196,25 +188,15 @@ def fields(message: Any, msgtype: str, make: Callable[..., Any]) -> dict[str, An
         sizes = {"width": message.width, "height": message.height}
         return found | arrays | sizes | {"distortion_model": message.distortion_model}
     data = bytes(message.data)
+    if msgtype == "sensor_msgs/msg/PointCloud2":  # Foxglove's points have no rows
+        rows = (data[i * message.row_step :] for i in range(message.height))
+        data = b"".join(row[: message.width * message.point_step] for row in rows)
     found["data"] = base64.b64encode(data).decode() if make is not made else data
     if msgtype == "sensor_msgs/msg/CompressedImage":
         return found | {"format": message.format}
     if msgtype == "sensor_msgs/msg/PointCloud2":
-        packed = [
-            make(
-                "PackedElementField",
-                name=each.name,
-                offset=int(each.offset),
-                type=NUMBERS[int(each.datatype)],
-            )
-            for each in message.fields
-        ]
-        rows = [
-            bytes(message.data[i * message.row_step :][: message.width * message.point_step])
-            for i in range(message.height)
-        ]
-        data = b"".join(rows)  # Foxglove's points have no rows
-        found["data"] = base64.b64encode(data).decode() if make is not made else data
+        parts = [(each.name, int(each.offset), NUMBERS[int(each.datatype)][0]) for each in message.fields]
+        packed = [make("PackedElementField", name=name, offset=at, type=kind) for name, at, kind in parts]
         return found | {"point_stride": message.point_step, "fields": packed}
     sizes = {name: getattr(message, name) for name in ("width", "height", "step", "encoding")}
     return found | sizes

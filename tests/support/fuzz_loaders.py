@@ -9,7 +9,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -145,27 +145,21 @@ def _answers(m: OccupancyMap) -> None:
     assert np.isfinite(m.occupancy(centres[:100])).all()
 
 
+_last: list[Dataset] = []
+"""The recording that was read last."""
+
+
 def _dataset(path: Path) -> bytes:
     dataset = open_dataset(path)
     content = frames_of(dataset)
-    _again.dataset = dataset
+    _last[:] = [dataset]
     return content
-
-
-class _Again:
-    """The recording that was read last."""
-
-    dataset: Dataset | None = None
-
-
-_again = _Again()
 
 
 def map_last_dataset() -> None:
     """Map what was read last, if it was a recording."""
-    if _again.dataset is not None:
-        mapped(_again.dataset)
-        _again.dataset = None
+    while _last:
+        mapped(_last.pop())
 
 
 def _map(path: Path) -> bytes:
@@ -185,25 +179,14 @@ def _chunks(path: Path) -> bytes:
     centres, p = m.voxels(min_probability=0.0)
     assert np.isfinite(centres).all()
     assert ((p >= 0) & (p <= 1)).all()
-    return _arrays_of(m.header, m.chunks, centres, p)
-
-
-def _arrays_of(*values: object) -> bytes:
-    return pickle.dumps(values)
-
-
-def _scans(path: Path) -> bytes:
-    scans = open_scans(path)
-    assert np.isfinite(scans.range_m).all()
-    assert np.isfinite(scans.pose_x_y_theta).all()
-    return _arrays_of(scans.range_m, scans.angle_rad, scans.pose_x_y_theta, scans.hit)
+    return pickle.dumps((m.header, m.chunks, centres, p))
 
 
 def _octomap(path: Path) -> bytes:
     leaves = read_octomap(path)
     bricks, log_odds = leaves.bricks()
     assert np.isfinite(log_odds).all()
-    return _arrays_of(leaves.voxel_size, bricks, log_odds)
+    return pickle.dumps((leaves.voxel_size, bricks, log_odds))
 
 
 def _config(path: Path) -> bytes:
@@ -213,72 +196,81 @@ def _config(path: Path) -> bytes:
     return commented_yaml(config).encode() + noise.table(CAMERA).coefficients.tobytes()
 
 
-def _noise(path: Path) -> bytes:
-    noise = PatchNoise.load(path)
-    return _arrays_of(noise.sigma, noise.bias, noise.patch, astuple(noise.camera))
-
-
-def _stream(path: Path) -> bytes:
-    stream = read_timed_poses(path)
-    return _arrays_of(stream.stamps, stream.poses)
-
-
 def _pose_graph(path: Path) -> bytes:
     graph = read_pose_graph(path)
     edges = [(e.first, e.second, e.T_first_second, e.information) for e in graph.edges]
     assert all(np.isfinite(T).all() for T in graph.poses.values())
-    return _arrays_of(dict(graph.poses), edges)
-
-
-def _plan(path: Path) -> bytes:
-    plan = read_floor_plan(path, (4.0, 3.0))
-    return _arrays_of(plan.wall, plan.pixel_x_y)
-
-
-def _mesh(path: Path) -> bytes:
-    mesh = load_mesh(path)
-    return _arrays_of(mesh.vertices, mesh.triangles)
+    return pickle.dumps((dict(graph.poses), edges))
 
 
 def _depth_images(path: Path) -> bytes:
     files = DepthFiles(path, 1000.0)
-    return _arrays_of(*((name, files.read(name)) for name in files.names))
+    return pickle.dumps([(name, files.read(name)) for name in files.names])
 
 
-def _with_camera(name: str, text: str, folder: Path) -> Path:
+def _parked(path: Path) -> bytes:
+    chunk = chunk_of(path.name)
+    assert chunk is not None
+    found = read_parked(path, chunk, 0.2)
+    return pickle.dumps([getattr(found, field.name) for field in fields(found)])
+
+
+def _parts(open_file: Callable[[Path], object], *names: str, finite: str = "") -> Callable[[Path], bytes]:
+    """Reads a file and takes some parts of what it holds, those in ``finite`` with finite numbers only."""
+
+    def read(path: Path) -> bytes:
+        whole = open_file(path)
+        assert all(np.isfinite(getattr(whole, name)).all() for name in finite.split())
+        return pickle.dumps([getattr(whole, name) for name in (*names, *finite.split())])
+
+    return read
+
+
+def _at(name: str, write: Callable[[Path], object]) -> Callable[[Path], Path]:
+    """Writes a file or folder of this name, or into the folder itself if it is empty."""
+
+    def make(folder: Path) -> Path:
+        write(folder / name)
+        return folder / name
+
+    return make
+
+
+def _file(name: str, content: str | bytes) -> Callable[[Path], Path]:
+    data = content.encode() if isinstance(content, str) else content
+    return _at(name, lambda path: path.write_bytes(data))
+
+
+def _with_camera(name: str, text: str, folder: Path) -> None:
     write_seven_scenes(folder, CONTENT)
     (folder / "camera.txt").unlink()
     (folder / name).write_text(text)
-    return folder
 
 
-def _open3d(folder: Path) -> Path:
+def _open3d(folder: Path) -> None:
     write_numbered(folder, CONTENT, place="depth")
     (folder / "camera.txt").unlink()
     entries = [{"extrinsic": column_by_column(p), "intrinsic": INTRINSIC} for p in CONTENT.poses]
     values = {"class_name": "PinholeCameraTrajectory", "parameters": entries}
     (folder / "trajectory.json").write_text(json.dumps(values, indent=1))
-    return folder
 
 
-def _record3d(folder: Path) -> Path:
+def _record3d(path: Path) -> None:
     """Packed where the library is there."""
     lzfse = import_module("lzfse") if find_spec("lzfse") else None
-    return write_record3d(folder / "walk", CONTENT, bytes if lzfse is None else lzfse.compress)
+    write_record3d(path, CONTENT, bytes if lzfse is None else lzfse.compress)
 
 
-def _npz_folder(folder: Path) -> Path:
+def _npz_folder(folder: Path) -> None:
     for name in ("a", "b"):
         write_npz(folder / f"{name}.npz", arrays(CONTENT))
-    return folder
 
 
-def _lidar_plies(folder: Path) -> Path:
+def _lidar_plies(folder: Path) -> None:
     for i, cloud in enumerate(WALK.clouds):
         write_cloud_ply(folder / f"{i + 0.5}.ply", cloud, ("ascii", "binary_little_endian")[i % 2])
     lines = [stamped_line(0.5 * i, WALK.poses[i // 2]) for i in range(2 * WALK.count)]
     (folder / "poses.txt").write_text("\n".join(lines))
-    return folder
 
 
 def _pcds(encoding: str, folder: Path) -> Path:
@@ -287,68 +279,34 @@ def _pcds(encoding: str, folder: Path) -> Path:
     return folder
 
 
-def _survey(folder: Path) -> Path:
+def _survey(path: Path) -> None:
     """Not packed: the unpacker of LAZ ends the process on some files whose packed points are damaged."""
     laspy = import_module("laspy")
     file = laspy.create(point_format=6, file_version="1.4")
     file.x, file.y, file.z = WALK.clouds[0].T
     file.gps_time = np.linspace(0.0, 0.3, len(WALK.clouds[0]))
-    file.write(folder / "walk.las")
+    file.write(path)
     lines = [stamped_line(stamp, WALK.poses[0]) for stamp in (-0.05, 0.05, 0.15, 0.25, 0.35)]
-    (folder / "walk.txt").write_text("\n".join(lines))
-    return folder / "walk.las"
+    path.with_suffix(".txt").write_text("\n".join(lines))
 
 
-def _several(folder: Path) -> Path:
-    write_npz(folder / "walk.npz", arrays(CONTENT))
-    write_lidar_scans(folder / "scans", WALK)
+def _several(path: Path) -> None:
+    write_npz(path.with_name("walk.npz"), arrays(CONTENT))
+    write_lidar_scans(path.with_name("scans"), WALK)
     text = "sensors:\n  - name: depth\n    source: walk.npz\n  - source: scans\n    sigma: [0.02, 0.001]\n"
-    (folder / "robot.yaml").write_text(text + "    every: 2\n    max_depth: 5.0\n")
-    return folder / "robot.yaml"
+    path.write_text(text + "    every: 2\n    max_depth: 5.0\n")
 
 
-def _packed_bag(mode: CompressionMode, folder: Path) -> Path:
+def _packed_bag(mode: CompressionMode) -> Callable[[Path], Path]:
     """A ROS 2 bag whose messages, or whose file, are compressed."""
-    writer: Any = Writer2(folder / "walk", version=9, storage_plugin=StoragePlugin.SQLITE3)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        plain(Bag("sqlite", writer))
-    return folder / "walk"
 
+    def write(path: Path) -> None:
+        writer: Any = Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            plain(Bag("sqlite", writer))
 
-def _image_file(suffix: str, folder: Path) -> Path:
-    return write_image(folder / f"image{suffix}", np.arange(48, dtype=np.uint8).reshape(6, 8))
-
-
-def _carmen_text() -> str:
-    lines = [ODOMETRY, flaser([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]), ODOMETRY, flaser([1.5, 2, 60], [1, 2, 3])]
-    return "\n".join([*lines, "PARAM x 1"])
-
-
-def _carmen(folder: Path) -> Path:
-    (folder / "walk.log").write_text(_carmen_text())
-    return folder / "walk.log"
-
-
-def _robotlaser(folder: Path) -> Path:
-    lines = [robotlaser([1.0, 2.0, 3.0], [0.1, i, 0.3], -1.5, 1.5, 81.9, (3, 4, 5)) for i in range(2)]
-    (folder / "walk.log").write_text("\n".join(lines))
-    return folder / "walk.log"
-
-
-def _carmen_gzip(folder: Path) -> Path:
-    (folder / "walk.log.gz").write_bytes(gzip.compress(_carmen_text().encode()))
-    return folder / "walk.log.gz"
-
-
-def _scan_npz(folder: Path) -> Path:
-    return write_scans(folder / "scans.npz")
-
-
-def _plan_png(folder: Path) -> Path:
-    wall = np.full((30, 40), 255, np.uint8)
-    wall[::7] = 0
-    return write_image(folder / "plan.png", wall)
+    return _at("walk", write)
 
 
 @cache
@@ -365,16 +323,6 @@ def _small_map(method: str) -> OccupancyMap:
     return m
 
 
-def _saved_map(method: str, folder: Path) -> Path:
-    _small_map(method).save(folder / "map.npz")
-    return folder / "map.npz"
-
-
-def _store(folder: Path) -> Path:
-    export_map(_small_map("mrf"), folder / "map.zarr")
-    return folder / "map.zarr"
-
-
 def _parked_chunk(folder: Path) -> Path:
     """A chunk that has left the window of a map."""
     m = MRFMap(0.2, max_depth=4.0, volume=VolumeConfig(window_m=2.0))
@@ -388,145 +336,130 @@ def _parked_chunk(folder: Path) -> Path:
     return Path(shutil.copy(file, folder))
 
 
-def _parked(path: Path) -> bytes:
-    chunk = chunk_of(path.name)
-    assert chunk is not None
-    found = read_parked(path, chunk, 0.2)
-    return _arrays_of(*(getattr(found, field.name) for field in fields(found)))
-
-
-def _octree(suffix: str, folder: Path) -> Path:
-    path = folder / f"map{suffix}"
-    (write_ot if suffix == ".ot" else write_bt)(path, _small_map("log_odds"))
-    return path
-
-
-def _yaml(folder: Path) -> Path:
-    tables = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
-    np.save(folder / "sigma.npy", tables)
-    np.save(folder / "bias.npy", tables)
+def _yaml(path: Path) -> None:
+    np.save(path.with_name("sigma.npy"), TABLES)
+    np.save(path.with_name("bias.npy"), TABLES)
     text = commented_yaml(Config()).replace("sigma_table: null", "sigma_table: sigma.npy")
     text = text.replace("bias_table: null", "bias_table: bias.npy").replace("patch: 20", "patch: 8")
-    (folder / "my.yaml").write_text("\n".join(x for x in text.splitlines() if "#" not in x))
-    return folder / "my.yaml"
+    path.write_text("\n".join(x for x in text.splitlines() if "#" not in x))
 
 
-def _noise_npz(folder: Path) -> Path:
-    tables = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
-    write_arrays(folder / "noise.npz", PatchNoise(tables, tables, 8, CAMERA).arrays())
-    return folder / "noise.npz"
-
-
-def _pose_graph_file(folder: Path) -> Path:
-    lines = [f"VERTEX3 {i} {i} 0 1 0.1 {i} 0.2" for i in range(3)]
-    lines += ["VERTEX_SE3:QUAT 7 1 2 3 0 0 0 1", "EDGE_SE3:QUAT 0 7 1 2 3 0 0 0 1 " + "1 " * 21]
-    path = folder / "graph.g2o"
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def _rtabmap_file(folder: Path) -> Path:
-    path, content = folder / "walk.db", CONTENT
+def _rtabmap_file(path: Path) -> None:
     database = Database(path)
-    height, width = content.size
-    camera = calibration(PinholeCamera(width, height, 14.0, 15.0, 7.5, 5.5))
-    for i in range(content.count):
-        depth = (rvl, encoded)[i % 2](content.depth[i])
-        database.add(i + 1, float(i), content.poses[i], depth, camera, encoded(content.color[i]))
-    database.optimise({i + 1: T for i, T in enumerate(content.poses)})
-    database.link(1, 2, 0, content.poses[0], np.eye(6))
+    for i in range(CONTENT.count):
+        depth = (rvl, encoded)[i % 2](CONTENT.depth[i])
+        database.add(i + 1, float(i), CONTENT.poses[i], depth, calibration(CAMERA), encoded(CONTENT.color[i]))
+    database.optimise({i + 1: T for i, T in enumerate(CONTENT.poses)})
+    database.link(1, 2, 0, CONTENT.poses[0], np.eye(6))
     database.connection.close()
-    return path
-
-
-def _stream_file(folder: Path) -> Path:
-    lines = [stamped_line(0.1 * i, pose) for i, pose in enumerate(CONTENT.poses)]
-    (folder / "poses.txt").write_text("\n".join(lines))
-    return folder / "poses.txt"
-
-
-def _stamps_file(folder: Path) -> Path:
-    (folder / "stamps.txt").write_text("0.5 a.png\n1.5 b.png\n")
-    return folder / "stamps.txt"
-
-
-def _stack(suffix: str, folder: Path) -> Path:
-    depth_m = np.stack(CONTENT.depth) / np.float32(1000)
-    if suffix == ".npy":
-        np.save(folder / "stack.npy", depth_m)
-    else:
-        np.savez(folder / "stack.npz", depth_m=depth_m)
-    return folder / f"stack{suffix}"
-
-
-def _ply(folder: Path) -> Path:
-    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
-    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
-    (folder / "mesh.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", ""]))
-    return folder / "mesh.ply"
-
-
-def _of(write: Callable[[Path, Content], Path], name: str = "") -> Callable[[Path], Path]:
-    """Writes the frames into the folder, or a file there."""
-    return lambda folder: write(folder / name, CONTENT)
 
 
 K_TXT = "14 0 7.5\n0 15 5.5\n0 0 1"
 CAMERA_YAML = "width: 16\nheight: 12\nfx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\n"
+TABLES = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
+GREY = np.arange(48, dtype=np.uint8).reshape(6, 8)
+PLAN = np.where(np.arange(30)[:, None] % 7 == 0, np.uint8(0), np.full((30, 40), 255, np.uint8))
+DEPTH_M = np.stack(CONTENT.depth) / np.float32(1000)
+TRIANGLE = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+CARMEN = "\n".join(
+    [
+        ODOMETRY,
+        flaser([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]),
+        ODOMETRY,
+        flaser([1.5, 2, 60], [1, 2, 3]),
+        "PARAM x 1",
+    ]
+)
+ROBOTLASER = [robotlaser([1.0, 2.0, 3.0], [0.1, i, 0.3], -1.5, 1.5, 81.9, (3, 4, 5)) for i in range(2)]
+GRAPH = "".join(f"VERTEX3 {i} {i} 0 1 0.1 {i} 0.2\n" for i in range(3))
+GRAPH += "VERTEX_SE3:QUAT 7 1 2 3 0 0 0 1\nEDGE_SE3:QUAT 0 7 1 2 3 0 0 0 1 " + "1 " * 21 + "\n"
+STREAM = "\n".join(stamped_line(0.1 * i, pose) for i, pose in enumerate(CONTENT.poses))
+
+_scans = _parts(open_scans, "angle_rad", "hit", finite="range_m pose_x_y_theta")
+_plan = _parts(lambda path: read_floor_plan(path, (4.0, 3.0)), "wall", "pixel_x_y")
 
 LOADERS = [
-    *(Loader(name, _of(each.write, "recording"), _dataset) for name, each in FORMATS.items()),
-    Loader("7-Scenes, camera.yaml", partial(_with_camera, "camera.yaml", CAMERA_YAML), _dataset),
-    Loader("7-Scenes, intrinsics.txt", partial(_with_camera, "intrinsics.txt", K_TXT), _dataset),
-    Loader("Open3D JSON", _open3d, _dataset),
-    Loader("Stray Scanner", _of(write_stray), _dataset),
-    Loader("Record3D", _record3d, _dataset),
-    Loader("Record3D .r3d", _of(write_record3d, "walk.r3d"), _dataset),
-    Loader(
-        "frames npz", lambda folder: write_npz(folder / "walk.npz", arrays(CONTENT)), _dataset, sealed=True
+    *(
+        Loader(name, _at("recording", partial(each.write, content=CONTENT)), _dataset)
+        for name, each in FORMATS.items()
     ),
-    Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
+    Loader("7-Scenes, camera.yaml", _at("", partial(_with_camera, "camera.yaml", CAMERA_YAML)), _dataset),
+    Loader("7-Scenes, intrinsics.txt", _at("", partial(_with_camera, "intrinsics.txt", K_TXT)), _dataset),
+    Loader("Open3D JSON", _at("", _open3d), _dataset),
+    Loader("Stray Scanner", _at("", partial(write_stray, content=CONTENT)), _dataset),
+    Loader("Record3D", _at("walk", _record3d), _dataset),
+    Loader("Record3D .r3d", _at("walk.r3d", partial(write_record3d, content=CONTENT)), _dataset),
+    Loader("frames npz", _at("walk.npz", partial(write_npz, values=arrays(CONTENT))), _dataset, sealed=True),
+    Loader("frames npz, folder", _at("", _npz_folder), _dataset, sealed=True),
     Loader("KITTI stereo", write_kitti, _dataset),
-    Loader("several sensors", _several, _dataset),
+    Loader("several sensors", _at("robot.yaml", _several), _dataset),
     Loader("stereo YAML", partial(write_stereo_file, names=["a", "b", "c"]), _dataset),
     Loader("lidar npz", partial(write_lidar_scans, walk=WALK), _dataset, sealed=True),
-    Loader("lidar PLY", _lidar_plies, _dataset),
+    Loader("lidar PLY", _at("", _lidar_plies), _dataset),
     *(
         Loader(f"PCD {each}", partial(_pcds, each), _dataset)
         for each in ("ascii", "binary", "binary_compressed")
     ),
     Loader("KITTI velodyne", lambda folder: write_velodyne(folder / "walk", WALK, WALK.poses[2]), _dataset),
-    *([Loader("LAS survey", _survey, _dataset)] if find_spec("laspy") else []),
+    *([Loader("LAS survey", _at("walk.las", _survey), _dataset)] if find_spec("laspy") else []),
     Loader("ROS 1 bag", lambda folder: write_bag(folder, plain, kind="ros1"), _dataset),
     Loader("ROS 2 bag, sqlite", lambda folder: write_bag(folder, plain, kind="sqlite"), _dataset),
     Loader("MCAP", lambda folder: write_bag(folder, plain, kind="mcap"), _dataset),
     Loader("ROS 2 bag, clouds", partial(write_clouds, kind="sqlite"), _dataset),
-    Loader("ROS 2 bag, packed messages", partial(_packed_bag, CompressionMode.MESSAGE), _dataset),
-    Loader("ROS 2 bag, packed file", partial(_packed_bag, CompressionMode.FILE), _dataset),
+    Loader("ROS 2 bag, packed messages", _packed_bag(CompressionMode.MESSAGE), _dataset),
+    Loader("ROS 2 bag, packed file", _packed_bag(CompressionMode.FILE), _dataset),
     *(
-        Loader(f"image {suffix}", partial(_image_file, suffix), lambda path: read_grey(path).tobytes())
+        Loader(
+            f"image {suffix}",
+            _at(f"image{suffix}", partial(write_image, image=GREY)),
+            lambda path: read_grey(path).tobytes(),
+        )
         for suffix in (".jpg", ".tiff", ".webp", ".bmp", ".pgm")
     ),
-    Loader("CARMEN log", _carmen, _scans),
-    Loader("CARMEN log, ROBOTLASER1", _robotlaser, _scans),
-    Loader("CARMEN log, gzip", _carmen_gzip, _scans, sealed=True),
-    Loader("scans npz", _scan_npz, _scans, sealed=True),
-    Loader("floor plan", _plan_png, _plan),
-    Loader("map, MRFMap", partial(_saved_map, "mrf"), _map, sealed=True),
-    Loader("map, LogOddsMap", partial(_saved_map, "log_odds"), _map, sealed=True),
-    *([Loader("map in chunks", _store, _chunks)] if find_spec("zarr") else []),
-    *([Loader("chunk outside the window", _parked_chunk, _parked, sealed=True)] if find_spec("zarr") else []),
-    Loader("OctoMap .ot", partial(_octree, ".ot"), _octomap),
-    Loader("OctoMap .bt", partial(_octree, ".bt"), _octomap),
-    Loader("configuration YAML", _yaml, _config),
-    Loader("noise.npz", _noise_npz, _noise, sealed=True),
-    Loader("pose stream", _stream_file, _stream),
-    Loader("pose graph", _pose_graph_file, _pose_graph),
-    Loader("RTAB-Map database", _rtabmap_file, _dataset),
-    Loader("stamps", _stamps_file, lambda path: _arrays_of(read_stamps(path))),
-    Loader("depth stack npy", partial(_stack, ".npy"), _depth_images),
-    Loader("depth stack npz", partial(_stack, ".npz"), _depth_images, sealed=True),
-    Loader("mesh PLY", _ply, _mesh),
+    Loader("CARMEN log", _file("walk.log", CARMEN), _scans),
+    Loader("CARMEN log, ROBOTLASER1", _file("walk.log", "\n".join(ROBOTLASER)), _scans),
+    Loader("CARMEN log, gzip", _file("walk.log.gz", gzip.compress(CARMEN.encode())), _scans, sealed=True),
+    Loader("scans npz", _at("scans.npz", write_scans), _scans, sealed=True),
+    Loader("floor plan", _at("plan.png", partial(write_image, image=PLAN)), _plan),
+    Loader("map, MRFMap", _at("map.npz", lambda path: _small_map("mrf").save(path)), _map, sealed=True),
+    Loader(
+        "map, LogOddsMap", _at("map.npz", lambda path: _small_map("log_odds").save(path)), _map, sealed=True
+    ),
+    *(
+        [
+            Loader(
+                "map in chunks", _at("map.zarr", lambda path: export_map(_small_map("mrf"), path)), _chunks
+            ),
+            Loader("chunk outside the window", _parked_chunk, _parked, sealed=True),
+        ]
+        if find_spec("zarr")
+        else []
+    ),
+    Loader("OctoMap .ot", _at("map.ot", lambda path: write_ot(path, _small_map("log_odds"))), _octomap),
+    Loader("OctoMap .bt", _at("map.bt", lambda path: write_bt(path, _small_map("log_odds"))), _octomap),
+    Loader("configuration YAML", _at("my.yaml", _yaml), _config),
+    Loader(
+        "noise.npz",
+        _at("noise.npz", lambda path: write_arrays(path, PatchNoise(TABLES, TABLES, 8, CAMERA).arrays())),
+        _parts(PatchNoise.load, "sigma", "bias", "patch", "camera"),
+        sealed=True,
+    ),
+    Loader("pose stream", _file("poses.txt", STREAM), _parts(read_timed_poses, "stamps", "poses")),
+    Loader("pose graph", _file("graph.g2o", GRAPH), _pose_graph),
+    Loader("RTAB-Map database", _at("walk.db", _rtabmap_file), _dataset),
+    Loader(
+        "stamps",
+        _file("stamps.txt", "0.5 a.png\n1.5 b.png\n"),
+        lambda path: pickle.dumps(read_stamps(path)),
+    ),
+    Loader("depth stack npy", _at("stack.npy", lambda path: np.save(path, DEPTH_M)), _depth_images),
+    Loader(
+        "depth stack npz", _at("stack.npz", partial(np.savez, depth_m=DEPTH_M)), _depth_images, sealed=True
+    ),
+    Loader("mesh PLY", _file("mesh.ply", TRIANGLE), _parts(load_mesh, "vertices", "triangles")),
 ]
 
 RECORDINGS = [loader.name for loader in LOADERS if loader.read is _dataset]

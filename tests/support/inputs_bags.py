@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from datasets_recordings import CAMERA, quaternion_of
 from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -69,14 +70,26 @@ class Bag:
         serialize = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
         self.writer.write(self.connections[key], nanoseconds(stamp + self.latency), serialize(message, name))
 
-    def message(self, name: str, /, **fields: Any) -> Any:
+    def message(self, name: str, /, **given: Any) -> Any:
+        """A message of a type: dictionaries stand for messages in it, and fields that are left out are 0."""
+        fields = {field: self._zero(kind) for field, kind in self.types.fielddefs[name][1]} | given
+        for field, (node, kind) in self.types.fielddefs[name][1]:
+            if node == Nodetype.NAME and isinstance(fields[field], dict):
+                fields[field] = self.message(kind, **fields[field])
         return self.types.types[name](**fields)
+
+    def _zero(self, kind: Any) -> Any:
+        match kind:
+            case (Nodetype.NAME, _):
+                return {}
+            case (Nodetype.BASE, (name, _)):
+                return "" if name == "string" else 0
+            case (_, (_, length)):
+                return np.zeros(length)
 
     def header(self, stamp: float, frame: str) -> Any:
         seconds, rest = divmod(nanoseconds(stamp), 10**9)
-        time = self.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
-        sequence = {"seq": 0} if self.kind == "ros1" else {}
-        return self.message("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+        return self.message("std_msgs/msg/Header", stamp={"sec": seconds, "nanosec": rest}, frame_id=frame)
 
     def image(
         self, topic: str, stamp: float, frame: str, image: NDArray, encoding: str, big: bool = False
@@ -86,17 +99,10 @@ class Bag:
         data = image.astype(image.dtype.newbyteorder(">" if big else "<")).view(np.uint8).reshape(height, -1)
         padded = np.pad(data, ((0, 0), (0, 4)))
         self.send(
-            topic,
-            "sensor_msgs/msg/Image",
-            stamp,
-            header=self.header(stamp, frame),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=int(big),
-            step=padded.shape[1],
+            topic, "sensor_msgs/msg/Image", stamp, header=self.header(stamp, frame), height=height,
+            width=width, encoding=encoding, is_bigendian=int(big), step=padded.shape[1],
             data=padded.reshape(-1),
-        )
+        )  # fmt: skip
 
     def compressed(self, topic: str, stamp: float, frame: str, image: NDArray, words: str) -> None:
         """A CompressedImage of a file; ``words`` is its format. Three channels are RGB."""
@@ -121,15 +127,9 @@ class Bag:
             with np.errstate(divide="ignore"):
                 image = np.where(image > 0, np.rint(scale / image + offset), 0).astype(np.uint16)
         packed = rvl(image) if "rvl" in packing else cv2.imencode(".png", image)[1].tobytes()
-        data = struct.pack("<iff", 0, scale, offset) + packed
-        self.send(
-            topic,
-            "sensor_msgs/msg/CompressedImage",
-            stamp,
-            header=self.header(stamp, frame),
-            format=f"{kind}; {packing}",
-            data=np.frombuffer(data, np.uint8),
-        )
+        data = np.frombuffer(struct.pack("<iff", 0, scale, offset) + packed, np.uint8)
+        name, words = "sensor_msgs/msg/CompressedImage", f"{kind}; {packing}"
+        self.send(topic, name, stamp, header=self.header(stamp, frame), format=words, data=data)
 
     def camera_info(
         self,
@@ -145,85 +145,47 @@ class Bag:
     ) -> None:
         """A CameraInfo; ``projection`` is that of the rectified images, ``part`` the region of interest as x,
         y, width and height."""
-        x, y, width, height = part
-        roi = self.message(
-            "sensor_msgs/msg/RegionOfInterest",
-            x_offset=x,
-            y_offset=y,
-            height=height,
-            width=width,
-            do_rectify=False,
-        )
-        P = np.zeros((3, 4))
-        P[:, :3] = matrix(projection or camera)
-        arrays = {
-            "d": np.array(distortion or [0.0] * 5),
-            "k": matrix(camera).reshape(-1),
-            "r": np.eye(3).reshape(-1),
-            "p": P.reshape(-1),
-        }
-        if self.kind == "ros1":
-            arrays = {name.upper(): values for name, values in arrays.items()}
+        roi = dict(zip(("x_offset", "y_offset", "width", "height"), part, strict=True))
+        P = np.column_stack([matrix(projection or camera), np.zeros(3)])
+        arrays = {"d": distortion or [0.0] * 5, "k": matrix(camera), "r": np.eye(3), "p": P}
         self.send(
-            topic,
-            "sensor_msgs/msg/CameraInfo",
-            stamp,
-            header=self.header(stamp, frame),
-            height=camera.height,
-            width=camera.width,
-            distortion_model=model,
-            binning_x=binning[0],
-            binning_y=binning[1],
-            roi=roi,
-            **arrays,
-        )
-
-    def vector(self, values: Iterable[float], name: str = "Vector3") -> Any:
-        return self.message(f"geometry_msgs/msg/{name}", **dict(zip("xyz", values, strict=True)))
-
-    def quaternion(self, values: Iterable[float]) -> Any:
-        return self.message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
-
-    def pose(self, T: Pose) -> Any:
-        place, turn = self.vector(T[:3, 3], "Point"), self.quaternion(quaternion_of(T[:3, :3]))
-        return self.message("geometry_msgs/msg/Pose", position=place, orientation=turn)
+            topic, "sensor_msgs/msg/CameraInfo", stamp, header=self.header(stamp, frame), roi=roi,
+            height=camera.height, width=camera.width, distortion_model=model,
+            binning_x=binning[0], binning_y=binning[1],
+            **{name.upper() if self.kind == "ros1" else name: np.ravel(v) for name, v in arrays.items()},
+        )  # fmt: skip
 
     def odometry(self, topic: str, stamp: float, frame: str, child: str, T: Pose) -> None:
-        zero = self.vector([0.0, 0.0, 0.0])
-        twist = self.message("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-        self.send(
-            topic,
-            "nav_msgs/msg/Odometry",
-            stamp,
-            header=self.header(stamp, frame),
-            child_frame_id=child,
-            pose=self.message(
-                "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(T), covariance=np.zeros(36)
-            ),
-            twist=self.message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
-        )
+        header, pose = self.header(stamp, frame), {"pose": pose_of(T)}
+        self.send(topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id=child, pose=pose)
 
     def pose_stamped(self, topic: str, stamp: float, frame: str, T: Pose) -> None:
         name = "geometry_msgs/msg/PoseStamped"
-        self.send(topic, name, stamp, header=self.header(stamp, frame), pose=self.pose(T))
+        self.send(topic, name, stamp, header=self.header(stamp, frame), pose=pose_of(T))
 
     def path(self, topic: str, stamp: float, frame: str, poses: Mapping[float, Pose]) -> None:
         """All poses of a body so far, by their stamps."""
         name = "geometry_msgs/msg/PoseStamped"
-        each = [self.message(name, header=self.header(s, frame), pose=self.pose(T)) for s, T in poses.items()]
+        each = [self.message(name, header=self.header(s, frame), pose=pose_of(T)) for s, T in poses.items()]
         self.send(topic, "nav_msgs/msg/Path", stamp, header=self.header(stamp, frame), poses=each)
 
     def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
         """A transform; of a matrix of zeros, with a quaternion of zeros."""
+        name, header = "geometry_msgs/msg/TransformStamped", self.header(stamp, parent)
         turn = quaternion_of(T[:3, :3]) if T[:3, :3].any() else np.zeros(4)
-        place = {"translation": self.vector(T[:3, 3]), "rotation": self.quaternion(turn)}
-        transform = self.message(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(stamp, parent),
-            child_frame_id=child,
-            transform=self.message("geometry_msgs/msg/Transform", **place),
-        )
-        self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[transform])
+        transform = {"translation": axes("xyz", T[:3, 3]), "rotation": axes("xyzw", turn)}
+        each = self.message(name, header=header, child_frame_id=child, transform=transform)
+        self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[each])
+
+
+def axes(names: str, values: Iterable[float]) -> dict[str, float]:
+    """The fields of a vector or of a quaternion."""
+    return dict(zip(names, values, strict=True))
+
+
+def pose_of(T: Pose) -> dict[str, dict[str, float]]:
+    """The fields of a Pose."""
+    return {"position": axes("xyz", T[:3, 3]), "orientation": axes("xyzw", quaternion_of(T[:3, :3]))}
 
 
 def rvl(image: NDArray[np.uint16]) -> bytes:
@@ -428,10 +390,9 @@ def imu(
         at = 0.8 + k / 200
         force = to_imu @ (GRAVITY * UP) + random.normal(0, shake + 1e-6, 3)
         bag.send(
-            topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, LINK),
-            orientation=bag.quaternion([0.0, 0.0, 0.0, 1.0]), orientation_covariance=np.zeros(9),
-            angular_velocity=bag.vector(to_imu @ RATE), angular_velocity_covariance=unknown,
-            linear_acceleration=bag.vector(force), linear_acceleration_covariance=np.zeros(9),
+            topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, LINK), orientation={"w": 1.0},
+            angular_velocity=axes("xyz", to_imu @ RATE), angular_velocity_covariance=unknown,
+            linear_acceleration=axes("xyz", force),
         )  # fmt: skip
     bag.latency = Bag.latency
 

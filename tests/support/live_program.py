@@ -1,4 +1,4 @@
-"""``taichi-mrf live`` as a person runs it: a process with a page, its words, and what is left of it."""
+"""``taichi-mrf live`` or ``tune`` as a person runs it: a process with a page, its words, what is left."""
 
 import os
 import re
@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 DEADLINE_S = 120.0
 """For what takes seconds, on a machine that is busy with something else."""
@@ -26,26 +25,33 @@ def with_shortest_life(seconds: float) -> tuple[str, str]:
     return "-c", program
 
 
-_ADDRESS = re.compile(r"The map is at (http://\S+)")
+_ADDRESS = re.compile(r"The (?:map|page) is at (http://\S+)")
 
 
 class LiveProgram:
     """The running program; use it as a context. ``address`` is where its page is, ``said`` what it has
     printed so far, line by line."""
 
-    def __init__(self, *arguments: str | Path, port: int = 0, start: tuple[str, str] = PROGRAM) -> None:
-        """Start it, on any free port unless told, and wait for its address. ``start`` are the interpreter's
-        arguments."""
-        command = [sys.executable, *start, "live", *map(str, arguments), "--port", str(port)]
+    def __init__(
+        self,
+        *arguments: str | Path,
+        command: str = "live",
+        port: int | None = 0,
+        start: tuple[str, str] = PROGRAM,
+    ) -> None:
+        """Start it, on any free port unless told, and wait for its address; None is for one without a page.
+        ``start`` are the interpreter's arguments."""
+        flags = [] if port is None else ["--port", str(port)]
         self.said: list[str] = []
         # A session of its own, so that whatever it starts can be found by the number of its group.
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-        )
+            [sys.executable, *start, command, *map(str, arguments), *flags],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         try:
-            self.address = wait_for(self._find_address, "the page's address")
+            self.address = "" if port is None else str(wait_for(self._find_address, "the page's address"))
         except BaseException:
             self.kill_group()
             raise
@@ -100,12 +106,7 @@ class LiveProgram:
     def __enter__(self) -> "LiveProgram":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.kill_group()
 
     def _read(self) -> None:

@@ -3,13 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+from hypothesis import assume
 from oracles import inference as reference
+from oracles.forward import Noise
 
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import AS_PRINTED
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 VOXEL = 0.1
@@ -74,6 +77,27 @@ def well_cut(rays: list[reference.Ray], longest: int) -> bool:
     """No corner is grazed (float32 may take the other way round it), and few enough voxels to enumerate."""
     cells = [s for ray in rays for s in ray.segments]
     return all(s.length > 0.02 for s in cells) and all(len(ray.segments) <= longest for ray in rays)
+
+
+def crossing(
+    seed: int, depths: tuple[float, ...], sigma: float, prior: float
+) -> tuple[MRFMap, list[reference.Ray], InferenceConfig]:
+    """Keyframes of one ray each, which meet in one voxel, and the rays of the oracle."""
+    rng = np.random.default_rng(seed)
+    shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
+    config = InferenceConfig(prior=prior, free_share=0.0)
+    poses, rays = [], []
+    for depth in depths:
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
+        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, Noise((sigma,)), max_depth=0.4)
+    assume(well_cut(rays, 9))
+    m = ExactMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
+    for depth, T in zip(depths, poses, strict=True):
+        m.add_keyframe(image(depth), T, ONE_PIXEL)
+    assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
+    return m, rays, config
 
 
 def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:

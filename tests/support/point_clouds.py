@@ -37,35 +37,25 @@ def in_order(points: Points) -> Points:
 
 
 def lzf(data: bytes) -> bytes:
-    """Pack bytes as libLZF does: repeats of three bytes and more, found by the last place of each triple."""
-    out, literals, last, at = bytearray(), bytearray(), {}, 0
-
-    def flush() -> None:
-        for start in range(0, len(literals), 32):
-            piece = literals[start : start + 32]
-            out.append(len(piece) - 1)
-            out.extend(piece)
-        literals.clear()
-
-    while at < len(data):
-        triple = data[at : at + 3]
-        first = last.get(triple)
-        last[triple] = at
-        if first is None or len(triple) < 3 or at - first > 8192:
-            literals.append(data[at])
+    """Pack bytes as libLZF does: runs of up to 32, and repeats of three bytes and more of the 8192 before."""
+    out, begin, at = bytearray(), 0, 0
+    while at <= len(data):
+        first = data.rfind(data[at : at + 3], max(0, at - 8192), at + 2) if at + 3 <= len(data) else -1
+        if first < 0 and at < len(data):
             at += 1
             continue
+        for run in (data[i : min(i + 32, at)] for i in range(begin, at, 32)):
+            out += bytes([len(run) - 1]) + run
+        if at == len(data):
+            break
         length = 3
         while length < 264 and at + length < len(data) and data[first + length] == data[at + length]:
             length += 1
-        flush()
         distance, coded = at - first - 1, length - 2
-        out.append(min(coded, 7) << 5 | distance >> 8)
-        if coded >= 7:
-            out.append(coded - 7)
-        out.append(distance & 255)
-        at += length
-    flush()
+        out += bytes(
+            [min(coded, 7) << 5 | distance >> 8, *([coded - 7] if coded >= 7 else []), distance & 255]
+        )
+        begin = at = at + length
     return bytes(out)
 
 

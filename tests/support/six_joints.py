@@ -4,8 +4,10 @@ it is and what the camera measures."""
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from armed_room import box_depth_m, to_box_m
+from numpy.typing import NDArray
 
+from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -19,18 +21,9 @@ AXES = np.array([[0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0
 WALL_HALF_M, ROD_HALF_M = np.array([3.0, 3.0, 0.1]), np.array([0.012, 0.5, 0.012])
 
 
-def _shift(m: ArrayLike) -> Pose:
-    T = np.eye(4)
-    T[:3, 3] = m
-    return T
-
-
-T_WORLD_WALL, T_WORLD_ROD = _shift([0, 0, 1.15]), _shift([0.02, 0, 0.94])
+T_WORLD_WALL = moved(np.eye(4), [0, 0, 1.15, 0, 0, 0])
+T_WORLD_ROD = moved(np.eye(4), [0.02, 0, 0.94, 0, 0, 0])
 """What is behind the arm and near it."""
-
-
-def joint_names() -> list[str]:
-    return [f"joint{i}" for i in range(6)]
 
 
 def angles_at(step: int) -> NDArray[np.float64]:
@@ -38,44 +31,18 @@ def angles_at(step: int) -> NDArray[np.float64]:
     return np.array([-1.0, 0.3, -0.35, 0.2, -0.3, 0.3]) + 0.09 * step * np.array([0.5, 1, -0.3, 0.5, -1, 0.4])
 
 
-def _turn(axis: NDArray[np.float64], angle: float) -> Pose:
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    T = np.eye(4)
-    T[:3, :3] += np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-    return T
-
-
 def links(angles: NDArray[np.float64]) -> list[Pose]:
     """The poses (4, 4) of the links' middles in the camera frame."""
-    T, found, tip = _shift(SHOULDER_M), [], np.array([0, 0, 2 * HALF_M[2]])
+    T, found, half_way = moved(np.eye(4), [*SHOULDER_M, 0, 0, 0]), [], [0, 0, HALF_M[2], 0, 0, 0]
     for axis, angle in zip(AXES, angles, strict=True):
-        T = T @ _turn(axis, angle)
-        found.append(T @ _shift(tip / 2))
-        T = T @ _shift(tip)
+        found.append(moved(moved(T, [0, 0, 0, *(angle * axis)]), half_way))
+        T = moved(found[-1], half_way)
     return found
-
-
-def box_depth_m(
-    camera: PinholeCamera, T_camera_box: Pose, half_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Axial depth (H, W) of a box, infinite beside it."""
-    T = inverse(T_camera_box)
-    with np.errstate(divide="ignore"):
-        sides = (np.array([[-1], [1]]) * half_m - T[:3, 3])[:, None, None] / (camera.rays() @ T[:3, :3].T)
-    enters, leaves = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
-    return np.where((enters < leaves) & (enters > 0), enters, np.inf)
 
 
 def to_arm_m(points_m: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """The distance (N,) of points (N, 3) of the camera frame to the arm, negative inside of it."""
-    found = []
-    for T_camera_link in links(angles):
-        T = inverse(T_camera_link)
-        beyond = np.abs(points_m @ T[:3, :3].T + T[:3, 3]) - HALF_M
-        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
-        found.append(outside + np.minimum(beyond.max(axis=-1), 0.0))
-    return np.min(found, axis=0)
+    return np.min([to_box_m(points_m, T, HALF_M) for T in links(angles)], axis=0)
 
 
 def inside_the_arm(angles: NDArray[np.float64], rng: np.random.Generator, many: int) -> NDArray[np.float64]:
@@ -89,7 +56,7 @@ def frames(steps: int) -> tuple[list[Frame], list[Frame]]:
     """A camera that goes along a wall with a rod before it; and the same with the arm before the camera."""
     camera, bare, armed = PinholeCamera(160, 120, 131.25, 131.25, 79.5, 59.5), [], []
     for step in range(steps):
-        T_world_camera = _shift(np.array([0.02 * step - 0.1, 0.01 * step, 0.0]))
+        T_world_camera = moved(np.eye(4), [0.02 * step - 0.1, 0.01 * step, 0, 0, 0, 0])
         T_camera_world = inverse(T_world_camera)
         wall = box_depth_m(camera, T_camera_world @ T_WORLD_WALL, WALL_HALF_M)
         rod = box_depth_m(camera, T_camera_world @ T_WORLD_ROD, ROD_HALF_M)
@@ -114,6 +81,8 @@ def write_robot(folder: Path, steps: int) -> dict[str, str]:
         parent, origin = f"link{i}", np.array([0, 0, 2 * HALF_M[2]])
     (folder / "six.urdf").write_text(f'<robot name="six">{"".join(parts)}</robot>')
     rows = [",".join(map(str, [step, *angles_at(step)])) for step in range(steps)]
-    (folder / "joints.csv").write_text("\n".join([",".join(["stamp", *joint_names()]), *rows]))
+    (folder / "joints.csv").write_text(
+        "\n".join([",".join(["stamp", *(f"joint{i}" for i in range(6))]), *rows])
+    )
     names = {"robot": str(folder / "six.urdf"), "joints": str(folder / "joints.csv")}
     return {**names, "camera_link": "optical"}

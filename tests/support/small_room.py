@@ -14,6 +14,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 
@@ -49,6 +50,14 @@ def probes() -> np.ndarray:
     """Centres of all voxels in a box around the room."""
     axes = [np.arange(-52, 52), np.arange(-46, 46), np.arange(-24, 24)]
     return (np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * VOXEL_SIZE
+
+
+def assert_same_voxels(a: OccupancyMap, b: OccupancyMap) -> None:
+    """Equal voxels and equal probabilities, bit for bit, in whatever order they come."""
+    (centres, p), (others, q) = a.voxels(0.0), b.voxels(0.0)
+    order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
+    np.testing.assert_array_equal(centres[order], others[other_order])
+    np.testing.assert_array_equal(p[order], q[other_order])
 
 
 if __name__ == "__main__":

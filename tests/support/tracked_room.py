@@ -8,6 +8,7 @@ import numpy as np
 from inputs_frames import Frames, of_frames
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose, tangent_norms
@@ -25,6 +26,20 @@ def frames() -> list[Frame]:
     that is carried about at 10 images a second, with a Kinect 1's noise."""
     dataset = open_dataset("synthetic:room?frames=100&width=160&height=120", color=False)
     return [replace(dataset.read(i), stamp=i / 10) for i in range(COUNT)]
+
+
+@cache
+def coarse_frames() -> list[Frame]:
+    """Eight frames of a third of the way round the room."""
+    dataset = open_dataset("synthetic:room?width=160&height=120&frames=20", color=False)
+    return [dataset.read(i) for i in range(8)]
+
+
+def disturbed(count: int, seed: int) -> list[Pose]:
+    """Poses of coarse frames, all but the first off by 2 cm and a degree along and about each axis."""
+    random, scale = np.random.default_rng(seed), np.repeat([0.02, np.radians(1.0)], 3)
+    true = [frame.T_world_camera for frame in coarse_frames()[:count]]
+    return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
 
 
 def walk(

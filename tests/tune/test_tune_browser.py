@@ -2,13 +2,14 @@
 
 import math
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from browser import LivePage, Seen, chromium, missing
-from tune_program import TuneProgram
+from live_program import LiveProgram
 
 from taichi_mrf.config import schema as config
 
@@ -23,16 +24,16 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 @pytest.fixture(scope="module")
 def page() -> Iterator[LivePage]:
     """One page for all tests, which follow each other as a person's doings do."""
-    flags = ("--voxel-size", "0.1", "--stride", "1", "--runtime.arch", "cpu", "--port", "0")
+    flags = ("--voxel-size", "0.1", "--stride", "1", "--runtime.arch", "cpu")
     with (
-        TuneProgram(ROOM, *flags) as program,
+        LiveProgram(ROOM, *flags, command="tune") as program,
         chromium() as browser,
-        LivePage(browser, program.address(), height=1000) as opened,
+        LivePage(browser, program.address, height=1000) as opened,
     ):
         opened.until(lambda seen: seen.settled and seen.voxels, "a settled map")
         yield opened
         assert opened.problems == []
-        assert program.end() == 130
+        assert program.end(signal.SIGINT)[0] == 130
 
 
 def rests(page: LivePage, number: int) -> Seen:

@@ -2,12 +2,12 @@
 
 import os
 import re
+import signal
 from pathlib import Path
 
 import pytest
 from console import assert_refused, complaints, mapped, taichi_mrf
-from live_program import wait_for
-from tune_program import TuneProgram
+from live_program import LiveProgram, wait_for
 
 from taichi_mrf.cli import main as cli
 from taichi_mrf.config import schema as config
@@ -48,9 +48,12 @@ def test_map_accepts_what_was_found(searched: tuple[Path, str], tmp_path: Path) 
 
 def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
     pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
-    with TuneProgram(ROOM, "--no-viewer", "--auto", "500", "--out", tmp_path, *FLAGS) as program:
-        wait_for(lambda: program.match(re.compile(r"try +(\d+)  log")), lambda: f"a try in {program.said}")
-        assert program.end() == 130
+    search = ("--no-viewer", "--auto", "500", "--out", tmp_path)
+    with LiveProgram(ROOM, *search, *FLAGS, command="tune", port=None) as program:
+        wait_for(
+            lambda: re.search(r"try +\d+  log", "\n".join(program.said)), lambda: f"a try in {program.said}"
+        )
+        assert program.end(signal.SIGINT)[0] == 130
     assert config.load(tmp_path / "best.yaml").voxel_size == 0.1
     assert len((tmp_path / "tries.csv").read_text().splitlines()) >= 2
 

@@ -5,12 +5,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 import viser
-from browser import LivePage, chromium, missing
+from browser import Browser, LivePage, missing
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,9 +25,6 @@ from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.messages import Scores
 from taichi_mrf.viewer.tune.page import TunePage
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
 
 HOSTILE = (
     "<iframe srcdoc=\"<script>parent.ran='srcdoc'</script>\"></iframe>"
@@ -110,12 +107,6 @@ TUNE_UPDATES: tuple[m.Update, ...] = (
 )
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    with chromium() as running:
-        yield running
-
-
 @contextmanager
 def served(
     new_page: NewPage,
@@ -157,7 +148,7 @@ def served(
     ids=["live", "tune"],
 )
 def test_hostile_names_are_shown_as_text(
-    browser: "Browser",
+    browser: Browser,
     new_page: Any,
     updates: tuple[m.Update, ...],
     counts: dict[str, int],
@@ -184,7 +175,7 @@ def test_hostile_names_are_shown_as_text(
 
 
 @needs_chromium
-def test_the_policy_stops_scripts_that_reach_the_page(browser: "Browser") -> None:
+def test_the_policy_stops_scripts_that_reach_the_page(browser: Browser) -> None:
     """Were a text not escaped, the browser would still run nothing of it."""
     server = start_server("127.0.0.1", 0, "Unescaped")
     try:
@@ -203,7 +194,7 @@ def test_the_policy_stops_scripts_that_reach_the_page(browser: "Browser") -> Non
 
 
 @needs_chromium
-def test_the_saved_page_runs_no_script_of_a_scene(browser: "Browser", tmp_path: Path) -> None:
+def test_the_saved_page_runs_no_script_of_a_scene(browser: Browser, tmp_path: Path) -> None:
     """A label that is raw HTML stands for any text that somebody forgot to escape."""
     server = start_server("127.0.0.1", 0, "Saved")
     try:

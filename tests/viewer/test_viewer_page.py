@@ -436,6 +436,14 @@ def test_a_ray_fills_in_its_pixel(handled: LivePage) -> None:
     assert handled.page.panel.pixel.value == (3.0, 4.0)
 
 
+def test_closing_the_answer_takes_its_ray_out_of_the_scene(handled: LivePage) -> None:
+    handled.take(answer(None, None))
+    assert handled.page.panel.ray._plot.visible
+    handled.act("Close")
+    assert not handled.page.panel.ray._plot.visible
+    assert "/ray" not in handled.server.scene._handle_from_node_name
+
+
 def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage) -> None:
     handled.act("Move")
     handled.take(answer(1, (3, 4)))

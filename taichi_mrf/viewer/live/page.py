@@ -104,7 +104,7 @@ class Page(BasePage[Panel]):
             LINK: self._tell_of_link,
             "Page (.html)": self.downloads.page,
             "Recording (.viser)": self._record,
-            "Close": lambda client: self.answer.clear(),
+            "Close": lambda client: self._close_answer(),
             **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
         server.scene.on_click()(lambda event: inbox.put(_click_of(event)))
@@ -409,6 +409,11 @@ class Page(BasePage[Panel]):
             known = self.keyframes.keyframes
             votes = [(known[id], log_odds) for id, log_odds in answer.votes if id in known]
             self.answer.show(self._facts(), votes, answer.known)
+
+    def _close_answer(self) -> None:
+        """Close the answer, and the ray that was asked with it."""
+        self.answer.clear()
+        self.panel.ray.clear()
 
     def _switch_off(self, place: int, client: int) -> None:
         """Switch off the keyframe at a place of the answer's list, and show what the others say of the

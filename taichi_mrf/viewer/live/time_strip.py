@@ -102,7 +102,7 @@ class TimeStrip:
             picture = image_html(near.picture, "height:5em")
         self._list.visible = bool(lines)
         items = "".join(f"<div>{in_html(line)}</div>" for line in lines)
-        style = "display:flex;gap:1em;padding:0 0.75em;font-size:0.8em;max-height:6em;overflow:auto"
+        style = "display:flex;gap:1em;padding:0 0.75em 0.75em;font-size:0.8em;max-height:7em;overflow:auto"
         self._list.content = f'<div style="{style}">{picture}<div>{items}</div></div>'
 
 
