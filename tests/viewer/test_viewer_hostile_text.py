@@ -142,7 +142,7 @@ def served(
         (
             TunePage,
             TUNE_UPDATES,
-            {"Parameters": 1, "Noise": 2, "Views": 4, "Tries": 2, "Map": 1, "Frames": 1, "About": 4},
+            {"Parameters": 1, "Noise": 2, "Views": 4, "Tries": 2, "Map": 1, "Frames": 5},
         ),
     ],
     ids=["live", "tune"],

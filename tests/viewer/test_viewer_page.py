@@ -438,10 +438,10 @@ def test_a_ray_fills_in_its_pixel(handled: LivePage) -> None:
 
 def test_closing_the_answer_takes_its_ray_out_of_the_scene(handled: LivePage) -> None:
     handled.take(answer(None, None))
-    assert handled.page.panel.ray._plot.visible
+    assert "/ray" in handled.server.scene._handle_from_node_name
     handled.act("Close")
-    assert not handled.page.panel.ray._plot.visible
     assert "/ray" not in handled.server.scene._handle_from_node_name
+    assert handled.page.panel.ray._plot.visible
 
 
 def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: LivePage) -> None:

@@ -411,9 +411,9 @@ class Page(BasePage[Panel]):
             self.answer.show(self._facts(), votes, answer.known)
 
     def _close_answer(self) -> None:
-        """Close the answer, and the ray that was asked with it."""
+        """Close the answer, and take its ray out of the scene; the plot stays."""
         self.answer.clear()
-        self.panel.ray.clear()
+        self.server.scene.remove_by_name("/ray")
 
     def _switch_off(self, place: int, client: int) -> None:
         """Switch off the keyframe at a place of the answer's list, and show what the others say of the
