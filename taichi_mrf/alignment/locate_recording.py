@@ -157,7 +157,7 @@ def _confirmed(
         shares.append(min(there.through, as_recorded))
         weights.append(there.overlap)
     through = float(np.average(shares, weights=weights))
-    if through <= stretches[number].may_look_through(whole):
+    if through <= whole.may_look_through(stretches[number].around):
         return found
     reason = f"where a part fits best, the others would look through {through:.0%} of what is mapped"
     return replace(found, T_map_recording=None, reason=f"another place: {reason}")
@@ -257,7 +257,7 @@ def _objection(seen: LocatedRecording, best: FoundPose, scan: Scan, whole: Whole
         return f"another place, or too little of it seen: {fit:.0%} of what is seen fits where most does"
     if seen.agreement < RULES.whole_agreement:
         return f"{where} {seen.agreement:.0%} of what is seen agrees"
-    if seen.through > scan.may_look_through(whole):
+    if seen.through > whole.may_look_through(scan.around):
         return f"{where} it would look through {seen.through:.0%} of what is mapped"
     if seen.in_free > (RULES.whole_scan_in_free if scan.around else RULES.whole_in_free):
         return f"{where} {seen.in_free:.0%} of what is seen lies where the map is free"

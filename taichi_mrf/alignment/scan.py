@@ -60,10 +60,6 @@ class Scan:
         """The points (N, 3), in metres in the map, from a pose (4, 4)."""
         return self.points.points.astype(np.float64) @ T_map_scan[:3, :3].T + T_map_scan[:3, 3]
 
-    def may_look_through(self, whole: WholeMap) -> float:
-        """The share of a map's walls up to which the scan may look through them."""
-        return RULES.whole_scan_through if self.around else whole.most_through
-
     def alike(self, whole: WholeMap, T_map_scan: Pose) -> float:
         """Correlation of the points' brightness with that of a map where they lie from a pose (4, 4); NaN
         unless both have enough colours."""

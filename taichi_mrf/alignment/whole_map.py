@@ -50,6 +50,10 @@ class WholeMap:
             (grid, 1, RULES.whole_places) for grid in fine
         ]
 
+    def may_look_through(self, around: bool) -> float:
+        """The share of the walls that a sensor may look through, which sees ``around`` or not."""
+        return RULES.whole_scan_through if around else self.most_through
+
     def in_free(self, points_m: NDArray[np.float64]) -> float:
         """The share of points (N, 3) around which all is free."""
         reach_m = max(RULES.whole_free_m, 2 * self.surface.cell_size)

@@ -291,7 +291,7 @@ def placed_in(m: OccupancyMap, name: str, dataset: Dataset, tell: Tell = lambda 
         map_origin_m=np.asarray(m.config.volume.origin),
         kept=kept,
         walls=whole.walls,
-        most_through=RULES.whole_scan_through if sees_around(dataset.camera) else whole.most_through,
+        most_through=whole.may_look_through(sees_around(dataset.camera)),
     )
 
 
