@@ -22,16 +22,10 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the run."""
-    return tmp_path_factory.mktemp("out")
-
-
-@pytest.fixture(scope="module")
-def program(out: Path, browser: Browser) -> Iterator[LiveProgram]:
+def program(browser: Browser) -> Iterator[LiveProgram]:
     """The room at a twentieth of its pace: one frame in four seconds, which a busy machine can draw. It
     begins when Chromium is there to see it."""
-    options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05", "--out", out)
+    options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05")
     with LiveProgram(ROOM, *options) as running:
         yield running
 
@@ -505,11 +499,19 @@ def test_on_a_phone_an_answer_is_read_below_the_middle_and_closed(
     with LivePage(browser, program.address, 390, 844) as page:
         page.page.emulate_media(color_scheme=scheme)
         page.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "the map")
-        places = [*page.places("/voxels/", "points"), *page.places("/surface/", "vertices")]
-        nearest = min(page.free_places(places[::20]), key=lambda place: place[2])
-        page.click(*nearest[:2])
         close = page.page.get_by_role("button", name="Close", exact=True)
         cell = page.page.get_by_role("cell", name="probability", exact=True)
+
+        def answered(seen: Seen) -> bool:
+            """Clicks again if the page's first view came late and took away what was clicked on."""
+            if not cell.count():
+                places = [*page.places("/voxels/", "points"), *page.places("/surface/", "vertices")]
+                nearest = min(page.free_places(places[::20]), key=lambda place: place[2])
+                page.click(*nearest[:2])
+                page.pause(2.0)
+            return bool(cell.count())
+
+        page.until(answered, "an answer to a click")
         lines = [cell, page.page.get_by_text("alone each would say"), close]
 
         def can_be_read(seen: Seen) -> bool:
@@ -601,16 +603,17 @@ def test_the_view_follows_the_camera(page: LivePage) -> None:
 
 
 def test_a_signal_ends_it_while_a_page_watches_and_keeps_what_is_mapped(
-    program: LiveProgram, browser: Browser, out: Path
+    browser: Browser, tmp_path: Path
 ) -> None:
-    with LivePage(browser, program.address) as page:
-        page.until_settled()  # so that few keyframes are those of the new map
-        page.select("Speed", "0.25x")
-        reset(page)
-        page.until(lambda seen: seen.agrees and seen.voxels and 1 <= len(seen.keyframes) < 4, "voxels")
-        status, _ = program.end(signal.SIGINT)
-    assert status == 128 + signal.SIGINT
-    program.wait_until_nothing_is_left()
+    out = tmp_path / "out"
+    options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--out", out)
+    with LiveProgram(ROOM, *options, "--speed", "0.01") as program:  # one frame in twenty seconds
+        with LivePage(browser, program.address) as page:
+            page.until(lambda seen: seen.agrees and seen.voxels, "voxels")
+            assert 1 <= len(page.look().keyframes) < 5
+            status, _ = program.end(signal.SIGINT)
+        assert status == 128 + signal.SIGINT
+        program.wait_until_nothing_is_left()
     assert {path.name for path in out.iterdir()} == {"map.npz", "voxels.ply", "config.yaml", "report.json"}
     m = MRFMap.load(out / "map.npz")
     assert 1 <= len(m.keyframes) < 5
