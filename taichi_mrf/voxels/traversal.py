@@ -72,6 +72,18 @@ class Walk(Struct):
 
 
 @ti.func
+def lesser(a: F32, b: F32) -> F32:
+    """The smaller of two numbers; ``ti.min`` also looks for NaN, which costs more."""
+    return ti.select(a < b, a, b)
+
+
+@ti.func
+def greater(a: F32, b: F32) -> F32:
+    """The larger of two numbers, likewise."""
+    return ti.select(a > b, a, b)
+
+
+@ti.func
 def make_ray(origin: Vec3, direction: Vec3) -> Ray:
     """A ray with its steps and reciprocal direction worked out once."""
     inverse = Vec3(FAR)
@@ -113,12 +125,13 @@ def enter(ray: Ray, t: F32, size: Template, first: IVec3, count: IVec3) -> Walk:
     """Start on a level whose cells are ``size`` voxels wide, at t, inside the parent's cells.
 
     These are ``count`` cells from ``first`` on, and the walk's cell is counted from there. It is clamped
-    among them: a t that stands on the parent's face may round to either side of it.
+    among them: a t that stands on the parent's face may round to either side of it, and a cast rounds up
+    below 0.
     """
     walk = Walk(IVec3(0), Vec3(0.0))
     for axis in ti.static(range(3)):
         position = (ray.origin[axis] + t * ray.direction[axis]) * (1.0 / size)
-        cell = ti.max(0, ti.min(count[axis] - 1, ti.floor(position, ti.i32) - first[axis]))
+        cell = ti.max(0, ti.min(count[axis] - 1, ti.cast(position, ti.i32) - first[axis]))
         walk.cell[axis] = cell
         face = (first[axis] + cell + (1 if ray.step[axis] > 0 else 0)) * size
         walk.leave[axis] = (face - ray.origin[axis]) * ray.inverse[axis]
@@ -128,7 +141,7 @@ def enter(ray: Ray, t: F32, size: Template, first: IVec3, count: IVec3) -> Walk:
 @ti.func
 def leave_at(walk: Walk) -> F32:
     """The t at which the ray leaves its cell."""
-    return ti.min(walk.leave[0], walk.leave[1], walk.leave[2])
+    return lesser(lesser(walk.leave[0], walk.leave[1]), walk.leave[2])
 
 
 @ti.func
@@ -175,8 +188,8 @@ def clip(ray: Ray, t_begin: Template, t_end: Template, lower: Vec3, upper: Vec3)
     for axis in ti.static(range(3)):
         t_low = (lower[axis] - ray.origin[axis]) * ray.inverse[axis]
         t_high = (upper[axis] - ray.origin[axis]) * ray.inverse[axis]
-        t_begin = ti.max(t_begin, ti.min(t_low, t_high))
-        t_end = ti.min(t_end, ti.max(t_low, t_high))
+        t_begin = greater(t_begin, lesser(t_low, t_high))
+        t_end = lesser(t_end, greater(t_low, t_high))
 
 
 @ti.func
@@ -203,7 +216,7 @@ def walk_bricks(
     chunk = enter(ray, t, CHUNK_VOXELS, IVec3(0), chunk_shape)
     while go == 1 and t < t_end and within(chunk.cell, chunk_shape):
         next_chunk = leave_at(chunk)
-        t_chunk = ti.min(next_chunk, t_end)
+        t_chunk = lesser(next_chunk, t_end)
         wanted = 1
         if ti.static(skip_empty):
             wanted = chunks[flat(chunk.cell, chunk_shape)]
@@ -212,12 +225,12 @@ def walk_bricks(
             brick = enter(ray, t, BRICK, first, IVec3(CHUNK))
             while go == 1 and t < t_chunk and inside_eight(brick.cell):
                 next_brick = leave_at(brick)
-                t_brick = ti.min(next_brick, t_chunk)
+                t_brick = lesser(next_brick, t_chunk)
                 if t_brick > t:  # a ray through an edge touches cells for no length at all
                     go = visit(state, context, ray, first + brick.cell, t, t_brick)
                     t = t_brick
                 advance(ray, brick, next_brick, BRICK)
-        t = ti.max(t, t_chunk)
+        t = greater(t, t_chunk)
         advance(ray, chunk, next_chunk, CHUNK_VOXELS)
 
 
@@ -256,7 +269,7 @@ def cross_brick(state: Template, inside: Template, ray: Ray, brick: IVec3, t_ent
         voxel = enter(ray, t, 1, brick * BRICK, IVec3(BRICK))
         while go == 1 and t < t_leave and inside_eight(voxel.cell):
             next_voxel = leave_at(voxel)
-            t_voxel = ti.min(next_voxel, t_leave)
+            t_voxel = lesser(next_voxel, t_leave)
             if t_voxel > t:
                 index = slot * VOXELS + voxel_number(voxel.cell)
                 go = inside.visit(state, inside.context, index, t, t_voxel)
