@@ -6,7 +6,7 @@ in a pool of bricks that a registry allocates.
 
 import dataclasses
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -100,6 +100,9 @@ class BrickMap(PixelReader, Owned):
     """What levels of free space mean in this map, from frames that it has not seen
     (evaluation.free_space.calibrate_free); ``taichi-mrf map`` finds it. None: by the default table."""
 
+    window: Any = None
+    """What keeps only a part of an MRFMap in memory (moving_window.MovingWindow), None if all of it stays."""
+
     _next_id: int
     """The id of the next keyframe: how many were added."""
 
@@ -158,7 +161,12 @@ class BrickMap(PixelReader, Owned):
             """Make the empty map of a whole configuration, which describes the noise unless it is given.
             Every constructor ends here; subclasses extend it."""
 
-        def add_keyframe(self, *arguments: Any, **keywords: Any) -> int: ...
+        def _take_in(
+            self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera,
+            **own: Any,
+        ) -> None:  # fmt: skip
+            """Keep keyframe number ``_next_id``; ``own`` are the arguments of :meth:`add_keyframe` from
+            ``color`` on, unchecked. If it raises, the map is as before."""
 
     def add(self, frame: Frame) -> int:
         """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. The configuration
@@ -173,14 +181,49 @@ class BrickMap(PixelReader, Owned):
         self.config = config  # not before the frame is in
         return id
 
-    def _stamp(self, stamp_s: Any) -> float:
-        """A new keyframe's stamp; the number of keyframes added before if it is None."""
-        return float(self._next_id) if stamp_s is None else seconds(stamp_s, "stamp_s")
+    def add_keyframe(
+        self,
+        depth_m: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        name: str = "",
+        stamp_s: float | None = None,
+        color: ArrayLike | None = None,
+        noise: NoiseModel | None = None,
+        sigma_m: ArrayLike | None = None,
+        no_return: ArrayLike | None = None,
+        pose_covariance: ArrayLike | None = None,
+        images: Mapping[str, ArrayLike] | None = None,
+    ) -> int:
+        """Add a depth image; returns its id. In an MRFMap it takes part in the next :meth:`infer`; maps of
+        other methods integrate it at once unless they are :attr:`stale`.
 
-    def _note_up(self, T_world_camera: Pose, camera: Camera) -> None:
-        """Keep which way is up if this is the first keyframe."""
+        ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
+        ``T_world_camera`` is (4, 4); ``stamp_s`` is its time in seconds, by default the number of keyframes
+        added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from which
+        :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard deviation
+        of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand for the
+        model's, and an infinite one means no measurement; ``no_return`` is (H, W), the pixels without a
+        return: bool, used according to ``sensor.no_return`` by the methods that can, or float32, the depth up
+        to which each is free (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the
+        pose error xi in the camera frame (metres, then radians) where the true pose is T_world_camera
+        exp(xi), None for an exact pose (sensor/pose_doubt.py); ``images`` are further images beside depth, by
+        name, for layers of voxels (voxels/layers.py). Raises KeyframeError for a wrong shape or pose and for
+        an invalid covariance, CapacityError if the map would not fit into memory, ConfigError for wrong
+        noise, and for images of which the method has no layer.
+        """
+        T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
+        stamp_s = float(self._next_id) if stamp_s is None else seconds(stamp_s, "stamp_s")
+        self._take_in(
+            name or f"keyframe {self._next_id}", T, stamp_s, depth_m, camera, color=color, noise=noise,
+            sigma_m=sigma_m, no_return=no_return, pose_covariance=pose_covariance, images=images,
+        )  # fmt: skip
         if self._up is None:
-            self._up = up_of(T_world_camera, camera.up)
+            self._up = up_of(T, camera.up)
+        self._next_id += 1
+        if self.window is not None:
+            self.window.follow(self, T[:3, 3])
+        return self._next_id - 1
 
     @tensors.in_kind("points", on_device=True)
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -127,13 +127,7 @@ class OccupancyMap(VoxelMap, Protocol):
         pose_covariance: ArrayLike | None = None,
         images: Mapping[str, ArrayLike] | None = None,
     ) -> int:
-        """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4) and a time in seconds, by
-        default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
-        maps that have colours (``METHOD.has_colors``); others raise ConfigError. ``noise`` is the keyframe's
-        own noise model, ``sigma_m`` (H, W) its own standard deviation of each pixel's depth in metres (0 and
-        NaN: the noise model's), ``no_return`` (H, W) pixels without a return (NoReturn), used according to
-        ``sensor.no_return`` in maps that support it, ``pose_covariance`` (6, 6) the uncertainty of the pose
-        (MRFMap.add_keyframe), ``images`` those of other layers of voxels, for maps that have colours."""
+        """Add a depth image as a keyframe; returns its id. For the arguments see BrickMap.add_keyframe."""
         ...
 
     def remove_keyframe(self, id: int) -> None:

@@ -19,7 +19,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -144,63 +143,37 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         self._find(id)
         return np.zeros((0, 3), np.int32)
 
-    def add_keyframe(
-        self,
-        depth_m: ArrayLike,
-        T_world_camera: ArrayLike,
-        camera: Camera,
-        name: str = "",
-        stamp_s: float | None = None,
-        color: ArrayLike | None = None,
-        noise: NoiseModel | None = None,
-        sigma_m: ArrayLike | None = None,
-        no_return: ArrayLike | None = None,
-        pose_covariance: ArrayLike | None = None,
-        images: Mapping[str, ArrayLike] | None = None,
-    ) -> int:
-        """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does. With a
-        half-life a scan that is older than another one makes the map stale.
-
-        ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-        ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before; ``noise``, ``sigma_m`` and ``pose_covariance`` are those of
-        MRFMap.add_keyframe, and ``no_return`` is checked, and used only by a log-odds map with
-        ``sensor.no_return: free``. Returns the keyframe's id. Raises KeyframeError for a wrong shape or pose,
-        CapacityError if the map would not fit, ConfigError for a ``color`` image or ``images``: the map has
-        no layers of these.
-        """
-        if color is not None or images:
+    def _take_in(
+        self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera, **own: Any
+    ) -> None:
+        """With a half-life a scan that is older than another one makes the map stale."""
+        if own.pop("color") is not None or own.pop("images"):
             raise ConfigError(
                 f"a map of the method {self.METHOD.name} has no colours: pass no color or images"
             )
-        T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
-        depth = checked_depth(depth_m, camera, self.sensor.min_depth)
-        depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
-        missing = checked_no_return(no_return, depth_m, camera)
+        depth, missing = checked_depth(depth_m, camera, self.sensor.min_depth), own.pop("no_return")
+        depth, evidence = checked_evidence(depth, camera, **own)
+        missing = checked_no_return(missing, depth_m, camera)
         if missing is not None:  # those that are free up to a depth of their own are for an MRFMap
             missing = without if (without := free_up_to_m(missing) < 0).any() else None
         if self._takes_no_return:
-            own = dataclasses.replace(own, no_return=missing)
+            evidence = dataclasses.replace(evidence, no_return=missing)
         elif missing is not None and self.sensor.no_return != "ignore":
             warnings.warn(
                 f"sensor.no_return: {self.sensor.no_return} has no effect: a map of the method "
                 f"{self.METHOD.name} takes no notice of {int(missing.sum())} pixels without a return. "
                 "Set it to ignore, or map with mrf (free, model) or log_odds (free)",
-                stacklevel=2,
+                stacklevel=3,
             )
         if not self._keyframes:
-            table = own.noise_model(self.noise, depth).table(camera)
+            table = evidence.noise_model(self.noise, depth).table(camera)
             warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)
-        name = name or f"keyframe {self._next_id}"
-        record = StoredKeyframe(self._next_id, name, depth, T, camera, self._stamp(stamp_s), own=own)
+        record = StoredKeyframe(self._next_id, name, depth, T_world_camera, camera, stamp_s, own=evidence)
         if not self.config.time.is_static and record.stamp_s < self._newest_s:
             self._stale = True  # it counts less than those that came before it
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
-        self._note_up(T, camera)
-        self._next_id += 1
-        return record.id
 
     def remove_keyframe(self, id: int) -> None:
         """Remove a keyframe. Its contribution stays in the map until the next :meth:`infer`."""

@@ -125,8 +125,7 @@ def enter(ray: Ray, t: F32, size: Template, first: IVec3, count: IVec3) -> Walk:
     """Start on a level whose cells are ``size`` voxels wide, at t, inside the parent's cells.
 
     These are ``count`` cells from ``first`` on, and the walk's cell is counted from there. It is clamped
-    among them: a t that stands on the parent's face may round to either side of it, and a cast rounds up
-    below 0.
+    among them: a t on the parent's face may round to either side of it, and a cast rounds up below 0.
     """
     walk = Walk(IVec3(0), Vec3(0.0))
     for axis in ti.static(range(3)):

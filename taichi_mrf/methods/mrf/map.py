@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config.sections import InferenceConfig, TimeConfig
-from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations, messages_at
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
@@ -128,49 +127,15 @@ class MRFMap(BrickMap):
         """Names of the keyframes that have been frozen, by id."""
         return MappingProxyType(self._parts.frozen)
 
-    def add_keyframe(
-        self,
-        depth_m: ArrayLike,
-        T_world_camera: ArrayLike,
-        camera: Camera,
-        name: str = "",
-        stamp_s: float | None = None,
-        color: ArrayLike | None = None,
-        noise: NoiseModel | None = None,
-        sigma_m: ArrayLike | None = None,
-        no_return: ArrayLike | None = None,
-        pose_covariance: ArrayLike | None = None,
-        images: Mapping[str, ArrayLike] | None = None,
-    ) -> int:
-        """Add a depth image. It takes part in the next :meth:`infer`.
-
-        ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-        ``T_world_camera`` is (4, 4); ``stamp_s`` is its time in seconds, by default the number of keyframes
-        added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from which
-        :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard deviation
-        of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand for the
-        model's, and an infinite one means no measurement; ``no_return`` is (H, W), the pixels without a
-        return: bool, used according to ``sensor.no_return``, or float32, the depth up to which each is free
-        (own_evidence.NoReturn); ``pose_covariance`` is (6, 6), the covariance of the pose error xi in the
-        camera frame (metres, then radians) where the true pose is T_world_camera exp(xi), None for an exact
-        pose (sensor/pose_doubt.py); ``images`` are further images beside depth, by name, for layers of voxels
-        (voxels/layers.py). Returns the id. Raises KeyframeError for a wrong shape or pose and for an invalid
-        covariance, CapacityError if the map would not fit into memory, ConfigError for wrong noise.
-        """
-        T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
-        name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        given = (color, noise, sigma_m, no_return, pose_covariance, images)
+    def _take_in(
+        self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera, **own: Any
+    ) -> None:
         # Step 1, intake: axial depth d_r of each pixel, checked and with its noise on the device.
-        image = self._parts.image(self.noise, depth_m, camera, *given)
+        image = self._parts.image(self.noise, depth_m, camera, **own)
         # Step 2, rays: which are cast and which bricks they cross (section IV-B). Steps 3 to 6 are infer's.
-        keyframe = self._parts.allocator.place(self._next_id, name, image, T, stamp_s)
+        keyframe = self._parts.allocator.place(self._next_id, name, image, T_world_camera, stamp_s)
         self._keyframes[keyframe.id] = keyframe
-        self._note_up(T, camera)
-        self._next_id += 1
         self._parts.settled = False
-        if self.window is not None:
-            self.window.follow(self, T[:3, 3])
-        return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
         """Remove a keyframe, its messages, and the bricks that no other owns. Raises KeyframeError."""

@@ -168,7 +168,7 @@ class MapParts:
         noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
         pose_covariance: ArrayLike | None, images: Mapping[str, ArrayLike] | None = None,
     ) -> DepthImage:  # fmt: skip
-        """The arguments of MRFMap.add_keyframe, checked, on the device; ``model`` is the map's noise."""
+        """The arguments of BrickMap.add_keyframe, checked, on the device; ``model`` is the map's noise."""
         sensor = self.config.sensor
         depth = checked_depth(depth_m, camera, sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
