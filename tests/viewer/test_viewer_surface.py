@@ -170,12 +170,15 @@ def status(**changes: object) -> m.Status:
 def test_while_frames_are_read_voxels_are_shown(drawn: SurfacePage) -> None:
     drawn.take(patch())
     drawn.take(VIEW)
-    for changes, shown in (
-        ({"finished": False}, "512 voxels"),
-        ({"paused": True, "finished": False}, "2 tri"),
+    widgets = [drawn.page.panel.view_options.handles[name] for name in ("draw_as", "color_by")]
+    for changes, shown, said in (
+        ({"finished": False}, "512 voxels", ["voxels", "marginal probability"]),
+        ({"paused": True, "finished": False}, "2 tri", ["surface", "height"]),
     ):
         drawn.take(status(**changes))
         assert drawn.draw().startswith(shown)
+        assert [widget.value for widget in widgets] == said
+        assert ("at the end, or while paused" in widgets[0].hint) == (said[0] == "voxels")
 
 
 def test_a_browser_begins_with_the_view_of_the_picture(drawn: SurfacePage) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import viser
@@ -142,7 +141,6 @@ class Page(BasePage[Panel]):
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
-        self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
         self.panel.show_keyframes({}, None)
         self.options = self.panel.view_options.value()  # what this map cannot show is not offered any more
         if self._extras(self.options) != self._extras(_PLAIN):

@@ -171,35 +171,32 @@ class Panel(BasePanel):
         had, has, self._no_surface = not self._no_surface, not why, why
         said = f"The map is drawn as voxels. There is no surface: {why}."
         change(drawn, hint=field_help(ViewOptions)["draw_as"] if has else said)
-        if had == has:
-            return
-        if has:
-            drawn.options = get_args(Draw)
-            drawn.value = self._chosen[0]
+        if had and not has:
+            first, self._chosen = ViewOptions(), (drawn.value, colors.value)
+            drawn.options = ("voxels",)
+            if self._chosen == (first.draw_as, first.color_by):
+                colors.value = GROWING
+        elif has and not had:
+            drawn.options, drawn.value = get_args(Draw), self._chosen[0]
             if colors.value == GROWING:
                 colors.value = self._chosen[1]
-            return
-        first, self._chosen = ViewOptions(), (drawn.value, colors.value)
-        drawn.options = ("voxels",)
-        if self._chosen == (first.draw_as, first.color_by):
-            colors.value = GROWING
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         h, activity = self._hello, status.activity
+        moving = not (status.paused or status.finished)
         if h.has_surface:
-            past = (
-                "it is made of the map as it is now, and this is an earlier time" if self.time.is_past else ""
-            )
-            self.show_lack_of_surface(status.no_surface or past)
+            past = "it is made of the map of now, and this is an earlier time" if self.time.is_past else ""
+            later = "it is made at the end, or while paused" if moving else ""
+            self.show_lack_of_surface(status.no_surface or past or later)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
         if not (status.voxels or self._names):
             ended = h.has_frames and not coming
             activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"
-        self.show_activity(activity, status.share, not (status.paused or status.finished))
+        self.show_activity(activity, status.share, moving)
         self._show_speed(status.speed)
-        self._size.content = f"Map: at most about {max(status.memory_mb, 1):,.0f} MB, it is compressed."
+        self._size.content = f"The map's file takes at most about {max(status.memory_mb, 1):,.0f} MB."
         self._numbers.content = rows_html(
             {
                 "source": h.source,
@@ -210,7 +207,7 @@ class Panel(BasePanel):
                 "frames": f"{status.frame} of {status.frames}" if status.frames else f"{status.frame}",
                 **({"sensor": status.arrivals} if status.arrivals else {}),
                 "keyframes": f"{status.keyframes} ({status.frozen} frozen)",
-                "keyframes per second": f"{status.keyframes_per_second:.1f}",
+                **({"keyframes per second": f"{status.keyframes_per_second:.1f}"} if moving else {}),
                 "voxels": f"{status.voxels:,} in {status.bricks:,} bricks",
                 "memory of the map": f"{status.memory_mb:,.0f} MB",
                 "edits": "inference is not finished" if status.pending else "all in the map",

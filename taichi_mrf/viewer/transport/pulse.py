@@ -122,6 +122,8 @@ style.textContent = `
   [data-dock-tab] { padding-inline: 0.5em !important; }  /* six tabs in a row */
   [style*="padding-bottom: 0.5em"] { padding-bottom: 0.3em !important; }  /* all layers without scrolling */
   p:has(> label[for]) { color: inherit !important; }  /* grey on grey else */
+  [style*="width: 3rem"] { width: 3.75rem !important; }  /* six figures beside a slider */
+  [role=tab][aria-selected=true] { color: light-dark(#1971c2, #4dabf7) !important; }
   [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }

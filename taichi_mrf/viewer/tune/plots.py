@@ -173,9 +173,9 @@ _SERIES = (
     ),
     uplot.Series(
         label="median ± spread", stroke="#56b4e9", width=0,
-        points={"show": True, "size": 6.0, "fill": "#ffffff"},
+        points={"show": True, "size": 6.0, "fill": "#56b4e9"},
     ),
-    uplot.Series(label="", stroke="#56b4e9", width=0, points={"show": True, "size": 6.0, "fill": "#ffffff"}),
+    uplot.Series(label="", stroke="#56b4e9", width=0, points={"show": True, "size": 6.0, "fill": "#56b4e9"}),
     uplot.Series(label="bias", stroke="#d55e00", width=2),
     uplot.Series(label="bias ± sigma", stroke="#e69f00", width=2),
     uplot.Series(label="", stroke="#e69f00", width=2),
