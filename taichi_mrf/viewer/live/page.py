@@ -376,8 +376,9 @@ class Page(BasePage[Panel]):
                 x, y, z = pixel.point.tolist()
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
-            x, y, z = voxel[0].tolist()
-            self._facts = partial(facts_of, voxel[0], self.map.store, self._hello)
+            point_m = self.map.voxel_near(voxel[0])
+            x, y, z = point_m.tolist()
+            self._facts = partial(facts_of, point_m, self.map.store, self._hello)
             self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
 
     def _framed(self, drawn: Framed) -> None:

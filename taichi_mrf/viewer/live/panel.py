@@ -218,18 +218,16 @@ class Panel(BasePanel):
     def _show_speed(self, factor: float | None) -> None:
         """Set the dropdown to the speed in force, also one that only the command line offers."""
         change(self.speed, visible=factor is not None)
-        if factor is None:
-            return
-        name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
-        change(self.speed, options=tuple(dict.fromkeys([*SPEEDS, name])), value=name)
+        if factor is not None:
+            name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
+            change(self.speed, options=tuple(dict.fromkeys([*SPEEDS, name])), value=name)
 
     def show_keyframes(self, keyframes: dict[int, m.KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
-        earlier = {True: "earlier, ", False: ""}
         self._names = {
-            f"{each.id}: {each.name} ({earlier[each.earlier]}{each.state})": each.id for each in listed
+            f"{each.id}: {each.name} ({'earlier, ' * each.earlier}{each.state})": each.id for each in listed
         }
         self.keyframe.options = list(self._names) or [NO_KEYFRAME]
         before, self._all = self._all, (float(min(keyframes, default=0)), float(max(keyframes, default=0)))

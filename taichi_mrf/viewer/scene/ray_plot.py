@@ -81,9 +81,8 @@ def curves(answer: RayAnswer) -> Curves:
     left = answer.visibility[np.maximum(voxel, 0)] if len(ends) else np.ones(len(x))
     visibility = np.where(voxel >= 0, left, 1.0)
     in_band = np.zeros(len(x)) if band is None else ((x >= band[0]) & (x <= band[1])).astype(float)
-    measured = np.zeros(len(x))
-    if answer.measured_m is not None:
-        measured = (np.abs(x - answer.measured_m) <= 1.5 * _STEP_M).astype(float)
+    measured_m = np.inf if answer.measured_m is None else answer.measured_m
+    measured = (np.abs(x - measured_m) <= 1.5 * _STEP_M).astype(float)
     return x, in_band, measured, visibility.astype(np.float64), steps[1], steps[0]
 
 

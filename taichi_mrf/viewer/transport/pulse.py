@@ -127,8 +127,7 @@ style.textContent = `
   [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }
-    [style*="position: fixed"][style*="width: 20em"]:has([aria-label$=" panel Answer"]) {
-      max-height: 45% !important; }  /* what was clicked on stays in sight */
+    [style*="position: fixed"][style*="width: 20em"] { max-height: 45% !important; }  /* the map stays seen */
     [aria-label^="Collapse panel "] + div { height: auto !important; }  /* 0 if it was opened unseen */
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
   }

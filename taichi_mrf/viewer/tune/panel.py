@@ -101,11 +101,10 @@ class TunePanel(BasePanel):
 
     def show_tuning(self, tuning: t.Tuning) -> None:
         """Show what is tuned, on which frames."""
-        choice = tuning.choice
         for name, handle in self.frames.handles.items():
             if name == "first":
                 handle.max = max(1, tuning.frames - 1)
-            handle.value = getattr(choice, name)
+            handle.value = getattr(tuning.choice, name)
         self._frame_text.content = in_markdown(
             f"{len(tuning.training)} frames make the map, {len(tuning.held_out)} are held out to score it"
             + (f", {len(tuning.unseen)} are kept back until the search has ended" if tuning.unseen else "")
