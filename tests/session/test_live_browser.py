@@ -503,11 +503,15 @@ def test_nothing_is_cut_off(
         assert "Map" in page.cut_off()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+SLOW_TO_DRAW = """const draw = requestAnimationFrame;
+window.requestAnimationFrame = then => setTimeout(() => draw(then), 500);"""
+
+
+@pytest.mark.parametrize(("scheme", "script"), [("light", ""), ("dark", SLOW_TO_DRAW)])
 def test_on_a_phone_an_answer_is_read_below_the_middle_and_closed(
-    program: LiveProgram, browser: "Browser", scheme: Literal["dark", "light"]
+    program: LiveProgram, browser: "Browser", scheme: Literal["dark", "light"], script: str
 ) -> None:
-    with LivePage(browser, program.address, 390, 844) as page:
+    with LivePage(browser, program.address, 390, 844, script) as page:
         page.page.emulate_media(color_scheme=scheme)
         page.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "the map")
         close = page.page.get_by_role("button", name="Close", exact=True)

@@ -102,7 +102,7 @@ let answer = "", opened = false;  // what the answer says, and whether it has op
 const showAnswer = () => {
   const head = narrow.matches && document.querySelector('[aria-label$=" panel Answer"]');
   const said = head?.nextElementSibling?.textContent ?? "";
-  const isOpen = headOfSheet()?.nextElementSibling?.offsetHeight > 0;
+  const isOpen = headOfSheet()?.querySelector("button");  // there at once, while the height grows
   if (!head && opened && isOpen) headOfSheet().click();
   if (!head) opened = false;
   if (head && said !== answer) {
