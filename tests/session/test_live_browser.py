@@ -193,7 +193,7 @@ def test_free_space_and_measured_points(page: LivePage, saved: MRFMap) -> None:
     page.tick("Free space")
     page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
     page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
-    page.until(lambda seen: "unknown: nothing" in page.text(), "the key to its colours")
+    page.until(lambda seen: "unknown (not drawn)" in page.text(), "the key to its colours")
     assert page.input("Cut axis").input_value() == "z"
     page.screenshot("free_space")
     page.tick("Free space", on=False)
@@ -462,12 +462,22 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         assert narrow.problems == []
 
 
-CUT_OFF = """() => [...document.querySelectorAll("button, label, p, td, [role=tab]")].filter(element => {
-  const {left, right, width} = element.getBoundingClientRect();
-  const fits = element.role === "tab" || element.scrollWidth <= element.clientWidth + 1;
-  return element.offsetParent && width && (left < 0 || right > innerWidth || !fits);
-}).map(element => element.textContent.trim())"""
-"""Texts of widgets that leave the window or do not fit into their place."""
+CHOSEN_TAB = """() => {
+  const tab = [...document.querySelectorAll("[role=tab][aria-selected=true]")].find(tab => tab.offsetParent);
+  let behind = tab;
+  while (getComputedStyle(behind).backgroundColor === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+  const colors = [getComputedStyle(tab).color, getComputedStyle(behind).backgroundColor];
+  return colors.map(color => color.match(/[0-9.]+/g).slice(0, 3).map(Number));
+}"""
+"""The colours of the chosen tab's name and of what is behind it."""
+
+
+def contrast(colors: list[list[int]]) -> float:
+    """Ratio of the luminances of two colours, as the Web Content Accessibility Guidelines have it."""
+    share = np.array(colors) / 255
+    linear = np.where(share > 0.04045, ((share + 0.055) / 1.055) ** 2.4, share / 12.92)
+    dark, light = sorted(linear @ (0.2126, 0.7152, 0.0722) + 0.05)
+    return float(light / dark)
 
 
 @pytest.mark.parametrize(
@@ -485,18 +495,23 @@ def test_nothing_is_cut_off(
         for tab in ("Map", "Keyframes", "Ray", "Images", "Save", "About"):
             page.tab(tab)
             page.pause(0.3)
-            assert page.page.evaluate(CUT_OFF) == [], tab
+            assert page.cut_off() == [], tab
+            assert contrast(page.page.evaluate(CHOSEN_TAB)) > 4.5, tab
         page.screenshot(f"{width}_{scheme}")
         assert page.problems == []
         page.page.evaluate("() => { document.querySelector('[role=tab]').style.marginLeft = '-3000px'; }")
-        assert "Map" in page.page.evaluate(CUT_OFF)
+        assert "Map" in page.cut_off()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+SLOW_TO_DRAW = """const draw = requestAnimationFrame;
+window.requestAnimationFrame = then => setTimeout(() => draw(then), 500);"""
+
+
+@pytest.mark.parametrize(("scheme", "script"), [("light", ""), ("dark", SLOW_TO_DRAW)])
 def test_on_a_phone_an_answer_is_read_below_the_middle_and_closed(
-    program: LiveProgram, browser: "Browser", scheme: Literal["dark", "light"]
+    program: LiveProgram, browser: "Browser", scheme: Literal["dark", "light"], script: str
 ) -> None:
-    with LivePage(browser, program.address, 390, 844) as page:
+    with LivePage(browser, program.address, 390, 844, script) as page:
         page.page.emulate_media(color_scheme=scheme)
         page.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "the map")
         close = page.page.get_by_role("button", name="Close", exact=True)

@@ -135,6 +135,17 @@ _POSITION = """async name => {
 }"""
 
 
+_CUT_OFF = """() => {
+  const widgets = [...document.querySelectorAll("button, input, label, p, td, [role=tab]")];
+  const cutOff = element => {
+    const {left, right, width} = element.getBoundingClientRect();
+    const fits = element.role === "tab" || element.scrollWidth <= element.clientWidth + 1;
+    return element.offsetParent && width && (left < 0 || right > innerWidth || !fits);
+  };
+  return widgets.filter(cutOff).map(element => element.value || element.textContent.trim());
+}"""
+
+
 def missing() -> str | None:
     """Part that this machine lacks to run a browser, None if all is there."""
     if importlib.util.find_spec("playwright") is None:
@@ -242,6 +253,10 @@ class LivePage:
     def pause(self, seconds: float) -> None:
         """Wait, while the page goes on."""
         self.page.wait_for_timeout(1000 * seconds)
+
+    def cut_off(self) -> list[str]:
+        """Texts of widgets that leave the window or do not fit into their place."""
+        return self.page.evaluate(_CUT_OFF)
 
     def text(self) -> str:
         """All text of the page, without the tabs that are not in front."""

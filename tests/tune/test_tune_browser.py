@@ -78,7 +78,7 @@ def test_the_page_begins_with_the_scores_of_the_parameters_in_force(page: LivePa
 
 
 @pytest.mark.parametrize(("width", "height"), [(1920, 1080), (390, 844), (1280, 1000)])
-def test_the_tabs_stand_in_one_row(page: LivePage, width: int, height: int) -> None:
+def test_the_tabs_stand_in_one_row_and_nothing_is_cut_off(page: LivePage, width: int, height: int) -> None:
     page.page.set_viewport_size({"width": width, "height": height})
     page.until(lambda seen: page.input("Surface density (per m)").is_visible(), "the panel")
     page.pause(0.5)
@@ -86,6 +86,10 @@ def test_the_tabs_stand_in_one_row(page: LivePage, width: int, height: int) -> N
     assert len(boxes) == 7
     assert len({box["y"] for box in boxes if box}) == 1
     assert all(box and box["x"] >= 0 and box["x"] + box["width"] <= width for box in boxes)
+    for name in ("Search", "Views", "Tries", "Noise", "Map", "Frames", "Parameters"):
+        page.tab(name)
+        page.pause(0.3)
+        assert page.cut_off() == [], name
     page.screenshot(f"tune_{width}")
 
 

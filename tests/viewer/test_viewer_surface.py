@@ -170,12 +170,15 @@ def status(**changes: object) -> m.Status:
 def test_while_frames_are_read_voxels_are_shown(drawn: SurfacePage) -> None:
     drawn.take(patch())
     drawn.take(VIEW)
-    for changes, shown in (
-        ({"finished": False}, "512 voxels"),
-        ({"paused": True, "finished": False}, "2 tri"),
+    widgets = [drawn.page.panel.view_options.handles[name] for name in ("draw_as", "color_by")]
+    for changes, shown, said in (
+        ({"finished": False}, "512 voxels", ["voxels", "marginal probability"]),
+        ({"paused": True, "finished": False}, "2 tri", ["surface", "height"]),
     ):
         drawn.take(status(**changes))
         assert drawn.draw().startswith(shown)
+        assert [widget.value for widget in widgets] == said
+        assert ("at the end, or while paused" in widgets[0].hint) == (said[0] == "voxels")
 
 
 def test_a_browser_begins_with_the_view_of_the_picture(drawn: SurfacePage) -> None:
@@ -370,7 +373,25 @@ def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> No
     drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0), (0.0, 0.0)))
     asked = drawn.asked[-1]
     assert isinstance(asked, m.RayThrough)
-    assert asked.point == pytest.approx((3.0, -3.0, 2.0))
+    assert asked.point == pytest.approx((3.0, -3.0, 2.0))  # no voxel is near
+
+
+def test_a_click_on_the_surface_beside_an_occupied_voxel_asks_for_that_voxel(drawn: SurfacePage) -> None:
+    log_odds = np.full((8, 8, 8), -900, np.int16)
+    log_odds[1, 2, 3] = 900  # its centre is at 0.95, -2.95, 1.15 m
+    brick = np.array([[1, -4, 1]], np.int32)
+    seen = np.zeros((1, 512), np.uint8)
+    drawn.take(m.Bricks("map", brick, log_odds.reshape(1, 512), seen, brick[:0]))
+    for aside_m, clicked, state in (
+        (0.06, (0.95, -2.95, 1.15), "occupied"),
+        (0.2, (0.95, -2.95, 1.35), "free"),
+    ):
+        vertices = patch().vertices_m - patch().vertices_m[0] + np.float32([0.95, -2.95, 1.15 + aside_m])
+        drawn.take(replace(patch(), vertices_m=vertices), VIEW)
+        drawn.draw()
+        drawn.take(Clicked((0.95, -9.0, 1.15 + aside_m), (0.0, 1.0, 0.0), (0.0, 0.0)))
+        assert drawn.asked[-1].point == pytest.approx(clicked)
+        assert drawn.page._facts()["state"] == state
 
 
 OF_MAP = {"draw_as", "color_by", "threshold", "size", "shade", "pictures"}

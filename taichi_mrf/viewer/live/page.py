@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import viser
@@ -142,7 +141,6 @@ class Page(BasePage[Panel]):
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
-        self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
         self.panel.show_keyframes({}, None)
         self.options = self.panel.view_options.value()  # what this map cannot show is not offered any more
         if self._extras(self.options) != self._extras(_PLAIN):
@@ -378,8 +376,9 @@ class Page(BasePage[Panel]):
                 x, y, z = pixel.point.tolist()
                 self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
-            x, y, z = voxel[0].tolist()
-            self._facts = partial(facts_of, voxel[0], self.map.store, self._hello)
+            point_m = self.map.voxel_near(voxel[0])
+            x, y, z = point_m.tolist()
+            self._facts = partial(facts_of, point_m, self.map.store, self._hello)
             self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
 
     def _framed(self, drawn: Framed) -> None:

@@ -171,35 +171,32 @@ class Panel(BasePanel):
         had, has, self._no_surface = not self._no_surface, not why, why
         said = f"The map is drawn as voxels. There is no surface: {why}."
         change(drawn, hint=field_help(ViewOptions)["draw_as"] if has else said)
-        if had == has:
-            return
-        if has:
-            drawn.options = get_args(Draw)
-            drawn.value = self._chosen[0]
+        if had and not has:
+            first, self._chosen = ViewOptions(), (drawn.value, colors.value)
+            drawn.options = ("voxels",)
+            if self._chosen == (first.draw_as, first.color_by):
+                colors.value = GROWING
+        elif has and not had:
+            drawn.options, drawn.value = get_args(Draw), self._chosen[0]
             if colors.value == GROWING:
                 colors.value = self._chosen[1]
-            return
-        first, self._chosen = ViewOptions(), (drawn.value, colors.value)
-        drawn.options = ("voxels",)
-        if self._chosen == (first.draw_as, first.color_by):
-            colors.value = GROWING
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
         h, activity = self._hello, status.activity
+        moving = not (status.paused or status.finished)
         if h.has_surface:
-            past = (
-                "it is made of the map as it is now, and this is an earlier time" if self.time.is_past else ""
-            )
-            self.show_lack_of_surface(status.no_surface or past)
+            past = "it is made of the map of now, and this is an earlier time" if self.time.is_past else ""
+            later = "it is made at the end, or while paused" if moving else ""
+            self.show_lack_of_surface(status.no_surface or past or later)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
         if not (status.voxels or self._names):
             ended = h.has_frames and not coming
             activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"
-        self.show_activity(activity, status.share, not (status.paused or status.finished))
+        self.show_activity(activity, status.share, moving)
         self._show_speed(status.speed)
-        self._size.content = f"Map: at most about {max(status.memory_mb, 1):,.0f} MB, it is compressed."
+        self._size.content = f"The map's file takes at most about {max(status.memory_mb, 1):,.0f} MB."
         self._numbers.content = rows_html(
             {
                 "source": h.source,
@@ -210,7 +207,7 @@ class Panel(BasePanel):
                 "frames": f"{status.frame} of {status.frames}" if status.frames else f"{status.frame}",
                 **({"sensor": status.arrivals} if status.arrivals else {}),
                 "keyframes": f"{status.keyframes} ({status.frozen} frozen)",
-                "keyframes per second": f"{status.keyframes_per_second:.1f}",
+                **({"keyframes per second": f"{status.keyframes_per_second:.1f}"} if moving else {}),
                 "voxels": f"{status.voxels:,} in {status.bricks:,} bricks",
                 "memory of the map": f"{status.memory_mb:,.0f} MB",
                 "edits": "inference is not finished" if status.pending else "all in the map",
@@ -221,18 +218,16 @@ class Panel(BasePanel):
     def _show_speed(self, factor: float | None) -> None:
         """Set the dropdown to the speed in force, also one that only the command line offers."""
         change(self.speed, visible=factor is not None)
-        if factor is None:
-            return
-        name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
-        change(self.speed, options=tuple(dict.fromkeys([*SPEEDS, name])), value=name)
+        if factor is not None:
+            name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
+            change(self.speed, options=tuple(dict.fromkeys([*SPEEDS, name])), value=name)
 
     def show_keyframes(self, keyframes: dict[int, m.KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
-        earlier = {True: "earlier, ", False: ""}
         self._names = {
-            f"{each.id}: {each.name} ({earlier[each.earlier]}{each.state})": each.id for each in listed
+            f"{each.id}: {each.name} ({'earlier, ' * each.earlier}{each.state})": each.id for each in listed
         }
         self.keyframe.options = list(self._names) or [NO_KEYFRAME]
         before, self._all = self._all, (float(min(keyframes, default=0)), float(max(keyframes, default=0)))

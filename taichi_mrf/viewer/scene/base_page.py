@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import numpy as np
@@ -115,6 +116,7 @@ class BasePage(Generic[P]):
         if self.map is not None:
             self.map.clear()
         self.map = MapScene(self.server, hello)
+        self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
 
     def look_from(self, side: Side, client: int) -> None:
         """Show all that is seen of the map to one client, or else of its keyframes."""

@@ -143,8 +143,7 @@ class BasePanel:
         triangles = counts.get("triangles")
         text = f"{counts['map']:,} voxels" if triangles is None else f"{triangles:,} triangles"
         others = (f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts.get(name))
-        text += "".join([" shown", *others])
-        text += "" if square_m is None else f" · ground: {square_m:g} m squares"
+        text += "".join([" shown", *others, "" if square_m is None else f" · ground: {square_m:g} m squares"])
         self._shown.content = text + (" · recording" if recording else "")
 
     def show_cut(self, ends_m: NDArray[np.float64] | None, in_middle: bool = False) -> None:

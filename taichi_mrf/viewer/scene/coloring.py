@@ -261,7 +261,7 @@ def legend_html(scale: Scale) -> str:
 
 def key_html(space: bool, changes: bool) -> str:
     """Key to the colours that are not on the scale, for the page: those of free space, and of changes."""
-    named: dict[str, tuple[int, ...]] = {**SPACE_COLORS, "unknown: nothing": (0, 0, 0, 0)} if space else {}
+    named: dict[str, tuple[int, ...]] = {**SPACE_COLORS, "unknown (not drawn)": (0, 0, 0, 0)} if space else {}
     if changes:
         named |= {"moves": DYNAMIC_COLOR, **CHANGE_COLORS}
     return _swatches(named)

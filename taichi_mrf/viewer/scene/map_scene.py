@@ -135,6 +135,13 @@ class MapScene:
             return np.zeros((0, 3))
         return self.surface.points() if self.shows_surface else self.layers["map"].points()
 
+    def voxel_near(self, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The centre of the voxel of the map at a point (3,) of what is shown: the surface may run through
+        the side of one that is not occupied, and then its neighbour is meant."""
+        centres = self.layers["map"].points()
+        apart_m = np.linalg.norm(centres - point_m, axis=1)
+        return centres[np.argmin(apart_m)] if (apart_m < 1.5 * self.hello.voxel_size).any() else point_m
+
     def seen_points(self) -> NDArray[np.float64]:
         """Points (n, 3) of all that is seen of both maps, in metres, world."""
         seen = [self.points(), self.layers["baseline"].points()]

@@ -23,7 +23,7 @@ _SERIES = (
     uplot.Series(label="range (m)"),
     uplot.Series(label="measured ± sigma", stroke="#e69f00", fill="#e69f0055", width=1),
     uplot.Series(label="measured", stroke="#d55e00", width=2),
-    uplot.Series(label="visibility", stroke="#404788", width=2),
+    uplot.Series(label="visibility", stroke="#5c7cfa", width=2),
     uplot.Series(label="omega (scaled to 1)", stroke="#e6007e", width=2),
     uplot.Series(label="p(occupied)", stroke="#1f968b", width=2),
 )
@@ -34,15 +34,15 @@ class RayPlot:
 
     def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self._text = gui.add_markdown("Click a voxel, or the picture of a keyframe.")
+        self._text = gui.add_markdown("")
         nothing = tuple(np.zeros(2) for _ in _SERIES)
         self._plot = gui.add_uplot(
             nothing,
             _SERIES,
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.05))},
             aspect=1.5,
-            visible=False,
         )
+        self.clear()
 
     def show(self, answer: RayAnswer) -> None:
         """Show the curves of a ray, and the ray in the scene."""
@@ -56,7 +56,7 @@ class RayPlot:
     def clear(self) -> None:
         """Hide the plot and the ray."""
         self._plot.visible = False
-        self._text.content = "Click a voxel, or the picture of a keyframe."
+        self._text.content = "Click a voxel or the picture of a keyframe, or type a pixel of the chosen one."
         self._scene.remove_by_name("/ray")
 
 
@@ -81,9 +81,8 @@ def curves(answer: RayAnswer) -> Curves:
     left = answer.visibility[np.maximum(voxel, 0)] if len(ends) else np.ones(len(x))
     visibility = np.where(voxel >= 0, left, 1.0)
     in_band = np.zeros(len(x)) if band is None else ((x >= band[0]) & (x <= band[1])).astype(float)
-    measured = np.zeros(len(x))
-    if answer.measured_m is not None:
-        measured = (np.abs(x - answer.measured_m) <= 1.5 * _STEP_M).astype(float)
+    measured_m = np.inf if answer.measured_m is None else answer.measured_m
+    measured = (np.abs(x - measured_m) <= 1.5 * _STEP_M).astype(float)
     return x, in_band, measured, visibility.astype(np.float64), steps[1], steps[0]
 
 

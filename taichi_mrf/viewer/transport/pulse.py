@@ -102,7 +102,7 @@ let answer = "", opened = false;  // what the answer says, and whether it has op
 const showAnswer = () => {
   const head = narrow.matches && document.querySelector('[aria-label$=" panel Answer"]');
   const said = head?.nextElementSibling?.textContent ?? "";
-  const isOpen = headOfSheet()?.nextElementSibling?.offsetHeight > 0;
+  const isOpen = headOfSheet()?.querySelector("button");  // there at once, while the height grows
   if (!head && opened && isOpen) headOfSheet().click();
   if (!head) opened = false;
   if (head && said !== answer) {
@@ -122,11 +122,12 @@ style.textContent = `
   [data-dock-tab] { padding-inline: 0.5em !important; }  /* six tabs in a row */
   [style*="padding-bottom: 0.5em"] { padding-bottom: 0.3em !important; }  /* all layers without scrolling */
   p:has(> label[for]) { color: inherit !important; }  /* grey on grey else */
+  [style*="width: 3rem"] { width: 3.75rem !important; }  /* six figures beside a slider */
+  [role=tab][aria-selected=true] { color: light-dark(#1971c2, #4dabf7) !important; }
   [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {
     [style*="width: 20em"] { width: 100% !important; }
-    [style*="position: fixed"][style*="width: 20em"]:has([aria-label$=" panel Answer"]) {
-      max-height: 45% !important; }  /* what was clicked on stays in sight */
+    [style*="position: fixed"][style*="width: 20em"] { max-height: 45% !important; }  /* the map stays seen */
     [aria-label^="Collapse panel "] + div { height: auto !important; }  /* 0 if it was opened unseen */
     [style*="cursor: pointer"][style*="; height: 3.5em"]::after { content: "▴▾"; padding-left: 1em; }
   }

@@ -101,11 +101,10 @@ class TunePanel(BasePanel):
 
     def show_tuning(self, tuning: t.Tuning) -> None:
         """Show what is tuned, on which frames."""
-        choice = tuning.choice
         for name, handle in self.frames.handles.items():
             if name == "first":
                 handle.max = max(1, tuning.frames - 1)
-            handle.value = getattr(choice, name)
+            handle.value = getattr(tuning.choice, name)
         self._frame_text.content = in_markdown(
             f"{len(tuning.training)} frames make the map, {len(tuning.held_out)} are held out to score it"
             + (f", {len(tuning.unseen)} are kept back until the search has ended" if tuning.unseen else "")
@@ -162,15 +161,16 @@ class TunePanel(BasePanel):
         """Accuracy in a held-out view, beside the reference; changes beside the depths."""
         self._accuracy.image, self._measured.image = view.accuracy, view.measured
         self._accuracy.visible = self._measured.visible = True
-        beside = f"**A** (left): {in_markdown(view.reference_title)}. " if view.reference_title else ""
-        self._accuracy_text.content = f"{beside}**B**: {in_markdown(view.title)}."
-        changed = f"{in_markdown(view.change_title)} (left); " if view.change_title else ""
-        self._measured_text.content = f"{changed}measured depth."
+        title, reference, changed = map(in_markdown, (view.title, view.reference_title, view.change_title))
+        both = f"**A** (left): {reference}.\n\n**B** (right): {title}."
+        self._accuracy_text.content = both if reference else f"**B**: {title}."
+        both = f"{changed} (left); measured depth (right)."
+        self._measured_text.content = both if changed else "Measured depth."
 
     def _search_tab(self) -> None:
         self.gui.add_markdown(
-            "Lets the computer move the sliders: prior, outliers and noise, beginning with the present ones. "
-            "Half of the held-out views are kept from the search and judge it at the end."
+            "The search moves the sliders of prior, outliers and noise for you, starting where they are. "
+            "Half of the held-out views are kept from it, to judge its result."
         )
         self.search = OptionWidgets(self.gui, t.StartSearch(), lambda: None)
         self.search.add()
@@ -295,7 +295,7 @@ def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) 
     key = "▸ shown · A reference · ★ best fit · ◆ from the search · ~ some of the pixels"
     return (
         '<div style="max-height:22em;overflow:auto;margin:0 0.5em">'
-        f'<table style="font-size:0.75em;border-spacing:0.4em 0;width:100%">{"".join(rows)}</table></div>'
+        f'<table style="font-size:0.75em;border-spacing:0;width:100%">{"".join(rows)}</table></div>'
         f'<div style="font-size:0.7em;opacity:0.65;margin:0.2em 0.9em">{key}</div>'
     )
 

@@ -52,9 +52,8 @@ def score_board_html(
         if first or kind not in firsts
         if any(math.isfinite(kind.value(each.scores)) for each in tries)
     ]
-    coarse = (
-        f", first look (1 pixel in {here.scores.pixel_stride**2})" if here.scores.pixel_stride > 1 else ""
-    )
+    stride = here.scores.pixel_stride
+    coarse = f", first look (1 pixel in {stride**2})" if stride > 1 else ""
     against = "" if reference is None or reference is here else f", against try {reference.number} (A)"
     head = (
         f'<tr><td colspan="4"><b>Try {here.number}</b>'
@@ -96,9 +95,8 @@ def sparkline_svg(values: Sequence[float], shown: int, reference: float) -> str:
     drawn = f'<polyline points="{points}" fill="none" stroke="{_LINE}" stroke-width="1.2"/>'
     if math.isfinite(reference):
         y = f"{height(min(max(reference, low), high)):.1f}"
-        drawn += (
-            f'<line x1="0" x2="{_WIDTH}" y1="{y}" y2="{y}" stroke="{_REFERENCE}" stroke-dasharray="2 2"/>'
-        )
+        ends = f'x1="0" x2="{_WIDTH}" y1="{y}" y2="{y}"'
+        drawn += f'<line {ends} stroke="{_REFERENCE}" stroke-dasharray="2 2"/>'
     if 0 <= shown < len(values) and math.isfinite(values[shown]):
         x = _MARGIN + shown * step
         drawn += f'<circle cx="{x:.1f}" cy="{height(values[shown]):.1f}" r="2.2" fill="{_DOT}"/>'
@@ -173,9 +171,9 @@ _SERIES = (
     ),
     uplot.Series(
         label="median ± spread", stroke="#56b4e9", width=0,
-        points={"show": True, "size": 6.0, "fill": "#ffffff"},
+        points={"show": True, "size": 6.0, "fill": "#56b4e9"},
     ),
-    uplot.Series(label="", stroke="#56b4e9", width=0, points={"show": True, "size": 6.0, "fill": "#ffffff"}),
+    uplot.Series(label="", stroke="#56b4e9", width=0, points={"show": True, "size": 6.0, "fill": "#56b4e9"}),
     uplot.Series(label="bias", stroke="#d55e00", width=2),
     uplot.Series(label="bias ± sigma", stroke="#e69f00", width=2),
     uplot.Series(label="", stroke="#e69f00", width=2),
