@@ -131,7 +131,7 @@ def test_a_map_loads_no_exporter_simulator_dataset_or_page() -> None:
     above = {"export", "datasets", "viewer", "session", "mapping", "factor_graph", "cli"}
     assert not {name for name in loaded if room(name) in above}
     lines = sum(len(modules()[name].read_text("utf-8").splitlines()) for name in loaded)
-    assert lines <= MOST_LOADED
+    assert lines <= MOST_LOADED, f"raise MOST_LOADED to {lines} if the new lines are worth it"
 
 
 def test_no_file_grows_past_500_lines() -> None:
