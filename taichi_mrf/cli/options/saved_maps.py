@@ -17,7 +17,7 @@ class Export:
     """Write a saved map in other formats, chosen by the files' extensions.
 
     .ply points, cubes or a mesh; .glb, .obj, .stl a mesh; .bt, .ot OctoMap; .pgm with .yaml a 2D map for
-    ROS's map_server; .npz arrays; .html a page that any browser opens; .zarr chunks of 64^3 voxels. Example:
+    ROS's map_server; .mcap Foxglove; .rrd Rerun; .npz arrays; .html a page; .zarr chunks of voxels. Example:
     taichi-mrf export out/map.npz --to room.ply room.bt floor.pgm --z-min 0.1 --z-max 1.5
     """
 
