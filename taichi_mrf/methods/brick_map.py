@@ -161,7 +161,7 @@ class BrickMap(PixelReader, Owned):
             """Make the empty map of a whole configuration, which describes the noise unless it is given.
             Every constructor ends here; subclasses extend it."""
 
-        def _take_in(
+        def _place_keyframe(
             self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera,
             **own: Any,
         ) -> None:  # fmt: skip
@@ -214,7 +214,7 @@ class BrickMap(PixelReader, Owned):
         """
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         stamp_s = float(self._next_id) if stamp_s is None else seconds(stamp_s, "stamp_s")
-        self._take_in(
+        self._place_keyframe(
             name or f"keyframe {self._next_id}", T, stamp_s, depth_m, camera, color=color, noise=noise,
             sigma_m=sigma_m, no_return=no_return, pose_covariance=pose_covariance, images=images,
         )  # fmt: skip

@@ -143,7 +143,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         self._find(id)
         return np.zeros((0, 3), np.int32)
 
-    def _take_in(
+    def _place_keyframe(
         self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera, **own: Any
     ) -> None:
         """With a half-life a scan that is older than another one makes the map stale."""

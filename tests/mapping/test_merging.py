@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 from two_days import CONFIG, COUNT, TODAY, YESTERDAY, recorded, turned_away
 
@@ -169,12 +170,15 @@ def test_maps_of_which_only_voxels_are_left_become_one(tmp_path: Path) -> None:
     assert share_beside(walls, found) > 0.95
     assert share_beside(found, walls) > 0.97
     assert len(found) < 1.2 * len(walls)
-    grid = np.stack(np.meshgrid(*[np.arange(-3, 3, 0.16)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    grid += np.array(ROOM_IN_WORLD)
-    before, after = at_once.marginals.state(grid), state(grid)
-    free = before == tm.FREE
+    grid = np.stack(np.meshgrid(*[np.arange(-3, 3, 0.16)] * 3, indexing="ij"), -1)
+    places = grid.reshape(-1, 3) + np.array(ROOM_IN_WORLD)
+    before, after = at_once.marginals.state(places), state(places)
+    free, unknown = before == tm.FREE, before == tm.UNKNOWN
     assert (after[free] == tm.FREE).mean() > 0.97
-    assert (after[before == tm.UNKNOWN] == tm.UNKNOWN).mean() > 0.95  # .97, by the machine
+    assert (after[unknown] == tm.UNKNOWN).mean() > 0.96
+    # Resampling carries evidence by a voxel, so beside known places the rounding of the pose decides.
+    apart = ~maximum_filter(~unknown.reshape(grid.shape[:3]), 3).ravel()
+    assert (after[apart] == tm.UNKNOWN).mean() > 0.99
 
 
 def share_beside(centres: NDArray[np.float64], others: NDArray[np.float64]) -> float:

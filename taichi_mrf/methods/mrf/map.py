@@ -127,7 +127,7 @@ class MRFMap(BrickMap):
         """Names of the keyframes that have been frozen, by id."""
         return MappingProxyType(self._parts.frozen)
 
-    def _take_in(
+    def _place_keyframe(
         self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera, **own: Any
     ) -> None:
         # Step 1, intake: axial depth d_r of each pixel, checked and with its noise on the device.
