@@ -31,8 +31,8 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_firs
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import collected_warnings
 from taichi_mrf.mapping.pipeline import SequenceRun
-from taichi_mrf.runs.files import MAP_FILE
-from taichi_mrf.runs.folder import RunFacts, write_run
+from taichi_mrf.session.files import MAP_FILE
+from taichi_mrf.session.folder import RunFacts, write_run
 from taichi_mrf.system import runtime
 
 

@@ -27,7 +27,7 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_firs
 from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, print_problem
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.errors import ConfigError, CutShortError
-from taichi_mrf.runs.files import holds_run
+from taichi_mrf.session.files import holds_run
 
 
 def run_live(options: Live) -> int:
@@ -51,7 +51,7 @@ def run_live(options: Live) -> int:
         tell_first_run(options.printing)
         from taichi_mrf.cli.map.task import settings_onto
         from taichi_mrf.cli.shared.learn_noise import learn_with_bar
-        from taichi_mrf.runs.folder import NO_HASTE, write_run
+        from taichi_mrf.session.folder import NO_HASTE, write_run
         from taichi_mrf.session.session import Session
         from taichi_mrf.session.session_core import Policy
         from taichi_mrf.session.source import open_among, open_source

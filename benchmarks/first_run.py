@@ -17,10 +17,14 @@ from pathlib import Path
 
 import tyro
 
-from taichi_mrf.kernels import bundles  # noqa: F401 (launches are watched)
-from taichi_mrf.kernels.types import F32Array, Template
-from taichi_mrf.system import compiler, compiling, runtime
+from taichi_mrf.system import (
+    bundles,  # noqa: F401 (launches are watched)
+    compiler,
+    compiling,
+    runtime,
+)
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32Array, Template
 
 WORSE = 1.1
 """A figure that has grown by more than this factor is worse."""

@@ -27,7 +27,7 @@ from taichi_mrf import Frame, MRFMap, accuracy, open_dataset
 from taichi_mrf.config.schema import Arch, VolumeConfig
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.evaluation.bench import octomap_available, octomap_inserter
-from taichi_mrf.experiments.scenes import Scene
+from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system import runtime
 

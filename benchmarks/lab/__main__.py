@@ -6,7 +6,7 @@ import tyro
 
 from taichi_mrf.cli.eval import run_eval
 from taichi_mrf.cli.options.measure import Eval
-from taichi_mrf.experiments.run import Entry
+from taichi_mrf.evaluation.experiments.run import Entry
 
 EXPERIMENTS = {
     "poses": Entry("benchmarks.lab.poses:run_poses", (0.05,)),

@@ -16,13 +16,13 @@ from benchmarks.lab.cell_truth import NOT_JUDGED, OCCUPIED, SeenSpace, occupied_
 from taichi_mrf import MRFMap, open_dataset
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
+from taichi_mrf.evaluation.experiments.contenders import Contender, mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView, house_scene, turned
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, reliability_bins, score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.pictures.reliability import reliability_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, mrf
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, turned
 from taichi_mrf.queries.cells import cell_probabilities
 from taichi_mrf.queries.known_bricks import BrickReader, sorted_bricks
 from taichi_mrf.queries.points import probability

@@ -18,7 +18,7 @@ from taichi_mrf import Frame, LogOddsMap, MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.sections import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom, distance_to_solids
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
-from taichi_mrf.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.simulate import KINECT_1

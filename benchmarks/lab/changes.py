@@ -26,9 +26,9 @@ from benchmarks.lab.change_runs import (
 from benchmarks.lab.moving_truth import MovingTruth
 from benchmarks.lab.robot_paths import LENGTH_M, PLAY_M, RADIUS_M
 from taichi_mrf.datasets.synthetic.room import SCRIPTS
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 
 TUNED_ON = 10
 """The seed of the scenes that the baselines are tuned on."""

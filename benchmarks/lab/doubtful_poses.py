@@ -16,11 +16,11 @@ from benchmarks.lab.poses import DISTURBED_M, DISTURBED_RAD, aligned, disturbed,
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
+from taichi_mrf.evaluation.experiments.contenders import mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.contenders import mrf
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.mrf.map import MRFMap

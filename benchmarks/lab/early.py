@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import cast_rays
-from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, mrf
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.judging import build, judge_all
-from taichi_mrf.experiments.scenes import (
+from taichi_mrf.evaluation.experiments.contenders import Contender, lidar_mrf, log_odds, mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.judging import build, judge_all
+from taichi_mrf.evaluation.experiments.scenes import (
     Scene,
     SceneView,
     coffin_scene,
@@ -28,7 +27,8 @@ from taichi_mrf.experiments.scenes import (
     lidar_scene,
     off_the_grid,
 )
-from taichi_mrf.experiments.stereo.street import mrf_of_street, street_scene
+from taichi_mrf.evaluation.experiments.stereo.street import mrf_of_street, street_scene
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera

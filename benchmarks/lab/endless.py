@@ -15,12 +15,12 @@ import numpy as np
 
 from taichi_mrf import MRFMap, open_dataset
 from taichi_mrf.evaluation.accuracy import Tolerance, judge_view
+from taichi_mrf.evaluation.experiments.exact import room_scene
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.exact import room_scene
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.system.atomic import atomic_path
 

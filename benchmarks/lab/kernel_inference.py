@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import FREE, OCCUPIED, UNKNOWN
-from taichi_mrf.experiments.scenes import SceneView
+from taichi_mrf.evaluation.experiments.scenes import SceneView
 from taichi_mrf.system.libraries import library
 
 LENGTHS_M, SPACINGS_M = (0.1, 0.2, 0.4, 0.8), (0.1, 0.25, 0.5)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from taichi_mrf.calibration.from_recording import learn_sigma
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.experiments.contenders import Contender
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene
+from taichi_mrf.evaluation.experiments.contenders import Contender
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import widened_noise
 

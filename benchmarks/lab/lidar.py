@@ -16,13 +16,13 @@ from benchmarks.lab.lidar_roc import roc_table
 from taichi_mrf.config.sections import WavemapConfig
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.experiments.contenders import Contender, lidar_mrf, log_odds, mrf, wavemap
+from taichi_mrf.evaluation.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
+from taichi_mrf.evaluation.experiments.judging import build, judge_all
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, lidar_scene
+from taichi_mrf.evaluation.experiments.tuning import tuned_contender
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, mrf, wavemap
-from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
-from taichi_mrf.experiments.judging import build, judge_all
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, lidar_scene
-from taichi_mrf.experiments.tuning import tuned_contender
 
 OPAQUE = "MRFMap, no beam passes"
 

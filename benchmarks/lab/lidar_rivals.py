@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 
 from taichi_mrf.config.sections import WavemapConfig
-from taichi_mrf.experiments.contenders import Contender, wavemap
+from taichi_mrf.evaluation.experiments.contenders import Contender, wavemap
 
 TUNED = "wavemap-style, tuned"
 

@@ -19,14 +19,14 @@ from benchmarks.lab.kernel_inference import KernelMap, KernelModel
 from benchmarks.lab.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
 from taichi_mrf import UNKNOWN, MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.evaluation.experiments.contenders import Contender, lidar_mrf, log_odds, row_name, wavemap
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.judging import build
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView
+from taichi_mrf.evaluation.experiments.tuning import GRID, NAME
 from taichi_mrf.evaluation.occupancy_scores import score_occupancy
 from taichi_mrf.evaluation.tables import Entry, Spread, Table
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, row_name, wavemap
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.judging import build
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, SceneView
-from taichi_mrf.experiments.tuning import GRID, NAME
 
 FOLDS = 4
 """Scan i is held out in fold i modulo this."""

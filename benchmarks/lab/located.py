@@ -26,10 +26,10 @@ from taichi_mrf.config.values import overridden
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.held_out import pooled_depth_error, surface_depth
 from taichi_mrf.evaluation.tables import Entry, Table, as_csv, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.onto import Placed, locate, placed_in, whole_map
 from taichi_mrf.mapping.selection import is_held_out

@@ -12,13 +12,13 @@ from benchmarks.lab.noise_scenes import NoiseCase, cases
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
+from taichi_mrf.evaluation.experiments.contenders import Contender, row_name, wavemap
+from taichi_mrf.evaluation.experiments.folds import Experiment, require_views
+from taichi_mrf.evaluation.experiments.judging import build
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene
+from taichi_mrf.evaluation.experiments.tuning import tuned_contender
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, row_name, wavemap
-from taichi_mrf.experiments.folds import Experiment, require_views
-from taichi_mrf.experiments.judging import build
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.experiments.tuning import tuned_contender
 from taichi_mrf.sensor.noise import NoiseModel
 
 GIVEN, AUTO = "MRFMap, given noise", "MRFMap, --noise auto"

@@ -16,9 +16,9 @@ from taichi_mrf import PolynomialNoise, open_dataset
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.scenes import (
+from taichi_mrf.evaluation.experiments.contenders import Contender, lidar_mrf, mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.scenes import (
     Scene,
     SceneView,
     coffin_scene,
@@ -26,7 +26,7 @@ from taichi_mrf.experiments.scenes import (
     kitchen_scene,
     lidar_scene,
 )
-from taichi_mrf.experiments.stereo.street import street_scene, thinned
+from taichi_mrf.evaluation.experiments.stereo.street import street_scene, thinned
 from taichi_mrf.sensor.simulate import SimulatedSensor, simulate
 
 STEREO_SIGMA = (0.0, 0.0, 0.00075291)

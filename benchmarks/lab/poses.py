@@ -17,12 +17,12 @@ from taichi_mrf import PinholeCamera, PolynomialNoise
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import PoseConfig, VolumeConfig
 from taichi_mrf.datasets.synthetic.room import RoomOptions, SyntheticRoom
+from taichi_mrf.evaluation.experiments.contenders import mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.judging import judge_all
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView, house_scene, kitchen_scene
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.contenders import mrf
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.judging import judge_all
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, kitchen_scene
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover

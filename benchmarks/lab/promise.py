@@ -21,12 +21,9 @@ from benchmarks.thin import configured, keys_of, truth_of
 from benchmarks.thin_rooms import SCENES, depth_camera, take_views
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
-from taichi_mrf.evaluation.free_space import calibrate_free
-from taichi_mrf.evaluation.occupancy_truth import SeenVoxels, occupancy_truth, seen_voxels
-from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.scenes import (
+from taichi_mrf.evaluation.experiments.contenders import Contender, lidar_mrf, mrf
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.scenes import (
     Scene,
     SceneView,
     coffin_scene,
@@ -36,6 +33,9 @@ from taichi_mrf.experiments.scenes import (
     off_the_grid,
     turned,
 )
+from taichi_mrf.evaluation.free_space import calibrate_free
+from taichi_mrf.evaluation.occupancy_truth import SeenVoxels, occupancy_truth, seen_voxels
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.queries.free import LEVELS as ALL_LEVELS

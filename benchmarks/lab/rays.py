@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from taichi_mrf.evaluation.experiments.contenders import Contender, mrf
+from taichi_mrf.evaluation.experiments.exact import room_scene
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.judging import build_and_judge
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, coffin_scene, house_scene, kitchen_scene
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, mrf
-from taichi_mrf.experiments.exact import room_scene
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.judging import build_and_judge
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, coffin_scene, house_scene, kitchen_scene
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

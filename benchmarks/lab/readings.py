@@ -20,21 +20,21 @@ from taichi_mrf import MRFMap
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh, scene_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
 from taichi_mrf.evaluation.accuracy import judge_view
-from taichi_mrf.evaluation.occupancy_scores import reliability_bins
-from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
-from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.contenders import mrf
-from taichi_mrf.experiments.exact import room_scene
-from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.judging import build
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import (
+from taichi_mrf.evaluation.experiments.contenders import mrf
+from taichi_mrf.evaluation.experiments.exact import room_scene
+from taichi_mrf.evaluation.experiments.folds import Experiment, fold_key, require_views
+from taichi_mrf.evaluation.experiments.judging import build
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import (
     OFF_THE_GRID_M,
     Scene,
     coffin_scene,
     house_scene,
     turned,
 )
+from taichi_mrf.evaluation.occupancy_scores import reliability_bins
+from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.view import View

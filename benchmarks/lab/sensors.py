@@ -18,9 +18,9 @@ from taichi_mrf import MRFMap, PolynomialNoise, SphericalCamera, open_dataset
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.queries.points import OCCUPIED
 from taichi_mrf.sensor.camera import Camera

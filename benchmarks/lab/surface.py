@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.evaluation.experiments.folds import Experiment, require_views
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.peers.systems import BLOCK, MOST_BLOCKS
+from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView, coffin_scene, house_scene
 from taichi_mrf.evaluation.surface_scores import SurfaceScores, SurfaceTruth, surface_truth
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment, require_views
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.peers.systems import BLOCK, MOST_BLOCKS
-from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene
 from taichi_mrf.export.surface import smooth_surface
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 from benchmarks.lab.submaps.equality import compare
 from taichi_mrf import ChunkedMap, MRFMap, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import atomic_path

@@ -25,10 +25,10 @@ import numpy as np
 import taichi_mrf as tm
 from taichi_mrf.config.sections import LIVE_HALF_LIFE_S
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, kitchen_scene, lidar_scene
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, kitchen_scene, lidar_scene
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 

@@ -7,9 +7,9 @@ read plus those written. What a CPU reads beside these because it is about to ov
 import time
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.types import I32, F32Array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, F32Array
 
 TRIES = 5
 STRIP = 64

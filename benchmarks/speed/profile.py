@@ -38,8 +38,7 @@ from taichi_mrf.evaluation.bench_pictures import STAGE_COLORS, STAGE_NAMES, TARG
 from taichi_mrf.evaluation.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.inference.sweep import TRACE_BYTES
-from taichi_mrf.kernels import quick_launch, quick_start
-from taichi_mrf.system import compiler, runtime
+from taichi_mrf.system import compiler, quick_launch, quick_start, runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 

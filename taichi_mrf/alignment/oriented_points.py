@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import I32, F32Array, F32Array2
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import origins_of, starts_at
 from taichi_mrf.sensor.unrolled import unrolled
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, F32Array, F32Array2
 
 STRIDE = 2
 """Pixels between points along both axes of the image."""

@@ -20,11 +20,11 @@ from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M
 from taichi_mrf.alignment.surfel_grid import SurfelGrid, SurfelPlanes
 from taichi_mrf.alignment.surfels import ROUGHNESS
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.resident import Resident, resident
-from taichi_mrf.kernels.types import I32, F32Array, F32Array2, IVec3, Mat3, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import Resident, resident
+from taichi_mrf.system.types import I32, F32Array, F32Array2, IVec3, Mat3, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.traversal import Viewpoint

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_mrf.alignment.surfels import Surfels
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.resident import resident
-from taichi_mrf.kernels.types import F32, F32Array2, I32Array, IVec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle
+from taichi_mrf.system.resident import resident
+from taichi_mrf.system.types import F32, F32Array2, I32Array, IVec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 

@@ -17,10 +17,10 @@ from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.rules import RULES
 from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, I32Array
 
 _SIDES = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(8) * np.pi / 4] + [[0, 0, 1], [0, 0, -1]])
 """(10, 3) directions by which normals are sorted, with z up: eight headings, up and down. A cell has a bit

@@ -18,7 +18,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_folder
 
-LABORATORY = "taichi_mrf.experiments.run"
+LABORATORY = "taichi_mrf.evaluation.experiments.run"
 """The module that has EXPERIMENTS and run_experiment."""
 
 ALL = "all"

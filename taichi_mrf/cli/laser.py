@@ -43,7 +43,7 @@ from taichi_mrf.export.map_server import grey_image, write_map_server
 from taichi_mrf.factor_graph.beams import Grid
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.solve import Solution, Step, solve
-from taichi_mrf.runs.report import report_json
+from taichi_mrf.session.report import report_json
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import atomic_path, write_npz, write_text
 from taichi_mrf.system.memory import peak_memory_mb

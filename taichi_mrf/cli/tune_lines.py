@@ -6,8 +6,8 @@ from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.cli.options.tune import Tune
 from taichi_mrf.cli.shared.serving import PrintLine
 from taichi_mrf.config.schema import Config
-from taichi_mrf.runs.files import NOISE_FILE
-from taichi_mrf.runs.noise import noise_notes, sensor_yaml
+from taichi_mrf.session.files import NOISE_FILE
+from taichi_mrf.session.noise import noise_notes, sensor_yaml
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.history import BEST_FILE, TABLE_FILE, Attempt
 from taichi_mrf.tune.search import Search

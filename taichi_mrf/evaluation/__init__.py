@@ -4,5 +4,7 @@ Begin with ``accuracy.py``, the paper's measures. ``held_out.py`` checks every r
 what levels of free space mean, ``pictures`` draws runs. ``keyframe_cost.py`` times a keyframe stage by stage,
 and ``bench.py`` fills the table of ``taichi-mrf bench``.
 
+``experiments`` makes the tables and figures of the papers.
+
 Uses `mapping` and the packages below it.
 """

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window, WindowIndex

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import OUTLIERS, JudgedView
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.queries.survey import OPAQUE, Occlusion, dim, occlusion
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
@@ -26,7 +24,9 @@ from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import CameraNoise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

@@ -22,8 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.evaluation.accuracy import log_density
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template
 from taichi_mrf.queries.survey import OPAQUE, Medium, dim, occlusion
 from taichi_mrf.queries.view import viewed_box
 from taichi_mrf.queries.voxel_map import VoxelMap
@@ -34,7 +32,9 @@ from taichi_mrf.sensor.limits import LEAST_SIGMA_M
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import CameraNoise, NoiseModel, unwidened_noise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 OCTAVES = np.arange(-3.0, 5.01, 0.5)

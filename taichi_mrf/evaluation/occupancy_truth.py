@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.marks import (
     WORDS,

@@ -20,9 +20,9 @@ from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import BeamWorkers, FactorGraph, beam_workers
 from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template
 
 FINE = 2.0**20
 """Beliefs are counted in integers of 1 / FINE: exact to 1e-6, and a million beams fit 64 bits."""

@@ -27,12 +27,12 @@ from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity, count_deg
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.inference.sum_product import TINY
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import softplus
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, F32Array2, I32Array, Struct, Template
 from taichi_mrf.sensor.forward import AUTO
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, F32Array2, I32Array, Struct, Template
+from taichi_mrf.voxels.log_odds import softplus
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex

@@ -44,9 +44,9 @@ from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import BeamWorkers, FactorGraph, beam_workers
 from taichi_mrf.factor_graph.potentials import GAUSSIAN, UNITS, Beam, BeamGraph, beam_graph
 from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import I32, I32Array, I64Array, Template
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, I32Array, I64Array, Template
 
 
 @ti.func

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import available_bytes
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, within
 

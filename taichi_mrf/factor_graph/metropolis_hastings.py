@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import CellLists, FactorGraph
 from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph, to_units
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, I32Array, I64Array, Template
 
 
 @ti.kernel

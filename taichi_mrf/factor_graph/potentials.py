@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import (
+from taichi_mrf.system.bundles import Bundle, kernel
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import (
     F32,
     I32,
     F32Array2,
@@ -34,7 +35,6 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec5,
 )
-from taichi_mrf.system.compiler import ti
 
 UNITS = 4096.0
 """Energies, messages and their sums are counted in integers of 1 / UNITS: they are the same in any order."""

@@ -27,8 +27,8 @@ from taichi_mrf.factor_graph.metropolis_hastings import (
     inverse_model,
 )
 from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph, energy, judged
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import I32, I32Array
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.types import I32, I32Array
 
 __all__ = ["METHODS", "Solution", "Step", "energy", "solve"]
 

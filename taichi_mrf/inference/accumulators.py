@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import ball_of
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, Template
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.window import Window
 

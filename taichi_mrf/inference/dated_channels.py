@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import faded
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, Template
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import faded
 from taichi_mrf.voxels.numbering import strip_begin
 from taichi_mrf.voxels.pool import grown
 

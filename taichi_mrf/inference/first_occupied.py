@@ -22,9 +22,9 @@ relative, so that no number is larger than the energies and the messages themsel
 and integers (of 1 / UNITS) do not overflow. Minimising, the functions take either.
 """
 
-from taichi_mrf.kernels.log_odds import softplus
-from taichi_mrf.kernels.types import Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import Template
+from taichi_mrf.voxels.log_odds import softplus
 
 NEVER = 1e9
 """Stands for the infinite cost of 'one of no cells is occupied'."""

@@ -16,12 +16,12 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnRays, RayList
 from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import END_SIGMAS
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import widened
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import FAR, Viewpoint, clip, walk_bricks

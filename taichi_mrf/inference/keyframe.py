@@ -8,15 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.resident import Resident, on_host, resident, zeros
-from taichi_mrf.kernels.types import I32, F32Array, I32Array
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import CameraNoise, NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import Resident, on_host, resident, zeros
+from taichi_mrf.system.types import I32, F32Array, I32Array
 from taichi_mrf.voxels.layers import pixel_layers
 from taichi_mrf.voxels.window import Window
 

@@ -1,10 +1,10 @@
 """A keyframe leaves: its messages are taken out of the beliefs, or stay in the evidence for good."""
 
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.log_odds import moves
-from taichi_mrf.kernels.types import AnyArray, F32Array, I32Array, Template
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import AnyArray, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import moves
 from taichi_mrf.voxels.numbering import strip_begin
 
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference import leave
 from taichi_mrf.inference.keyframe import VisibleBricks
-from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool

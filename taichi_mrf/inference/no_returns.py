@@ -12,11 +12,11 @@ from taichi_mrf.inference.keyframe import DepthImage, NoReturnRays
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, I64Array
 from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.own_evidence import free_up_to_m
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, I64Array
 from taichi_mrf.voxels.traversal import Space, Viewpoint
 
 

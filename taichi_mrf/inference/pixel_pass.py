@@ -29,12 +29,12 @@ from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.inference.voxel_share import VoxelShare
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.resident import Resident
-from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Struct, Template, Vec4
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.resident import Resident
+from taichi_mrf.system.types import F32, I32, I32Array, I64Array, Struct, Template, Vec4
 from taichi_mrf.voxels.layers import FromPixels, imported
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_begin, strip_length

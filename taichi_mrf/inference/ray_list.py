@@ -19,12 +19,12 @@ import numpy as np
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
 from taichi_mrf.inference.ray_model import END_SIGMAS
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.voxels.traversal import FAR, pixel_ray
 
 LEVELS = 10

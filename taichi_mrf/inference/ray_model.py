@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Template, Vec4Array
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, I64Array, Template, Vec4Array
 
 END_SIGMAS = 3.0
 """A ray ends this many sigma behind its measurement, and bricks are allocated this many sigma around it."""

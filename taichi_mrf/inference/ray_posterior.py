@@ -24,12 +24,12 @@ from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_
 from taichi_mrf.inference.ray_model import RayModel, log_pass
 from taichi_mrf.inference.sum_product import crossing, passage
 from taichi_mrf.inference.workers import Workers
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative, log_let_through
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec4
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec4
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import exp_of_negative, log_let_through
 from taichi_mrf.voxels.numbering import flat, strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.traversal import InBricks, Space, Viewpoint, clip, cross_brick, walk_bricks

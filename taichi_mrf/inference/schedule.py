@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.system import runtime
+from taichi_mrf.system.resident import on_host
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 

@@ -37,9 +37,11 @@ from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.ray_list import block_ray, end_of_shared_path, listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, log_let_through, moves
-from taichi_mrf.kernels.types import (
+from taichi_mrf.sensor.forward import AUTO
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import (
     F32,
     I32,
     AnyArray,
@@ -51,10 +53,8 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
-from taichi_mrf.sensor.forward import AUTO
-from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import clamped_log_odds, exp_of_negative, log_let_through, moves
 from taichi_mrf.voxels.numbering import strip_begin
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 

@@ -17,9 +17,9 @@ from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
 from taichi_mrf.inference.surface_rays import SCALE, AddDistances, Band, DistanceSums
 from taichi_mrf.inference.workers import workers_without_trace
-from taichi_mrf.kernels.resident import on_host, zeros
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.resident import on_host, zeros
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool, PoolPart

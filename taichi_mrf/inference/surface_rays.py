@@ -27,11 +27,11 @@ from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_posterior import RayVisitor
 from taichi_mrf.inference.sum_product import TINY
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, IVec3, Template, Vec3, Vec4
 from taichi_mrf.sensor.forward import SUPPORT
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, I32Array, I64Array, IVec3, Template, Vec3, Vec4
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, walk_voxels
 

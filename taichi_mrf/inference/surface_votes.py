@@ -36,11 +36,11 @@ from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.resident import zeros
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Struct, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import zeros
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, I64Array, Struct, Template
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_begin, strip_length
 from taichi_mrf.voxels.pool import BrickPool, PoolPart

@@ -15,10 +15,10 @@ from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import END_SIGMAS, Limits, RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
-from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.later import later
+from taichi_mrf.system.resident import on_host, vec4_array
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool

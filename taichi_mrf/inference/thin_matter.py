@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference.brick_sums import VOTES
 from taichi_mrf.inference.surface_votes import called
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.resident import zeros
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import zeros
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, Template
 from taichi_mrf.voxels.blended_field import AROUND, cell_of, voxel_around
 from taichi_mrf.voxels.calls import MATTER, SUREST
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, rows_around

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.pixel_pass import PixelVisitor, add_pair
 from taichi_mrf.inference.ray_list import block_of
-from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template, Vec4
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, I32Array, I64Array, Template, Vec4
 
 MOST_PIXELS = 32.0
 """A keyframe's weight in a voxel stops growing at so many pixels."""

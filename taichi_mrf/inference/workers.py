@@ -3,10 +3,10 @@ bricks."""
 
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import I32, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, Template
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ counts as occupied (OctoMap).
 
 import math
 
-from taichi_mrf.kernels.log_odds import faded
-from taichi_mrf.kernels.types import F32, F32Array, I32Array, Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import faded
 from taichi_mrf.voxels.numbering import strip_begin
 
 UNKNOWN_LOG_ODDS = 0.0

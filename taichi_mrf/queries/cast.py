@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.queries.given_rays import GivenRays, RaySpace, WindowRays
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

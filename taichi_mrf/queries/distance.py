@@ -13,8 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import (
+from taichi_mrf.queries.box import voxels_of_box
+from taichi_mrf.queries.distance_bricks import DistanceBricks
+from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid, SpaceRules, UnknownSpace
+from taichi_mrf.queries.free import bound_now
+from taichi_mrf.queries.voxel_map import VoxelMap
+from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.bundles import Bundle, kernel
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.owner import Owned
+from taichi_mrf.system.types import (
     F32,
     F64,
     I32,
@@ -28,14 +36,6 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
-from taichi_mrf.queries.box import voxels_of_box
-from taichi_mrf.queries.distance_bricks import DistanceBricks
-from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid, SpaceRules, UnknownSpace
-from taichi_mrf.queries.free import bound_now
-from taichi_mrf.queries.voxel_map import VoxelMap
-from taichi_mrf.system import runtime, tensors
-from taichi_mrf.system.compiler import ti
-from taichi_mrf.system.owner import Owned
 from taichi_mrf.voxels.layout import BRICK
 
 _EDGE = 1e-3

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.resident import resident
 from taichi_mrf.queries.distance_grid import (
     COLUMNS,
     FAR,
@@ -36,6 +35,7 @@ from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.resident import resident
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
 
 _BYTES_PER_BRICK = 4 * (COLUMNS + 2 * VOXELS + SAMPLES)

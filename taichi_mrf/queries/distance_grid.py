@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import within

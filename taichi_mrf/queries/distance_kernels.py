@@ -14,8 +14,6 @@ other voxel, negative. In both sums the voxels of the other kind have the distan
 both.
 """
 
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.queries.distance_grid import (
     ALL_BITS,
     COLUMNS,
@@ -27,7 +25,9 @@ from taichi_mrf.queries.distance_grid import (
     UNKNOWN_BITS,
     FieldGrid,
 )
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 

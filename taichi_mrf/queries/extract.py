@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32, F32Array, I32Array
 from taichi_mrf.queries.points import probability
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array, I32Array
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.pool import BrickPool
 

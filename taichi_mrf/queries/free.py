@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.points import FREE, checked_points, state_of
 from taichi_mrf.queries.within import checked_paths, path_places
 from taichi_mrf.sensor.distortion import DistortedCamera
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array
 
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999)
 """Levels that have bounds of their own; between them bounds are interpolated."""

@@ -20,9 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.given_rays import RaySpace
 from taichi_mrf.queries.survey import OPAQUE, Occlusion, occlusion, stopped_share
 from taichi_mrf.queries.voxel_map import VoxelMap
@@ -30,7 +27,10 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, Struct, Template
+from taichi_mrf.voxels.log_odds import exp_of_negative, logistic
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 _THINNEST = 1e-6

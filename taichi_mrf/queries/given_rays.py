@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F64, I32, AnyArray2, DVec3, F32Array, F32Array2, F64Array, Vec3
 from taichi_mrf.queries.known_bricks import seen_free_bricks
 from taichi_mrf.queries.voxel_map import VoxelMap
 from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F64, I32, AnyArray2, DVec3, F32Array, F32Array2, F64Array, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window
 

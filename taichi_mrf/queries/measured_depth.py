@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Template, Vec3, Vec4
 from taichi_mrf.queries.view import viewed_box
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, Template, Vec3, Vec4
 from taichi_mrf.voxels.blended_field import blended, cell_of
 from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, DistanceField
 from taichi_mrf.voxels.layout import BRICK, VOXELS

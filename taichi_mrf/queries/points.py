@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import CROSSED, Topology
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
-from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.sensor.forward import SEGMENT
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, Struct, Template
+from taichi_mrf.voxels.log_odds import exp_of_negative, softplus
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 

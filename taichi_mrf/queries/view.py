@@ -14,16 +14,16 @@ from taichi_mrf.config.arguments import array
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.survey import Answers, Medium, Occlusion, SurfaceSurvey, occlusion, survey_rays
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import CameraNoise, NoiseTable
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.log_odds import logistic
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import FAR, Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window, WindowIndex

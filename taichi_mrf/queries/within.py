@@ -22,14 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array, real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Template, Vec3
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.log_odds import logistic
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.pool import BrickPool
 

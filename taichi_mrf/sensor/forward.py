@@ -6,8 +6,8 @@ depth for a pinhole), because that is what depth images hold and what noise is l
 kernels, which reach them through model.Sensor; each is tested against a NumPy oracle.
 """
 
-from taichi_mrf.kernels.types import F32, Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, Template
 
 AUTO, SEGMENT, CENTRE = 0, 1, 2
 """The point or average of a segment that stands for its surface: see InferenceConfig.likelihood."""

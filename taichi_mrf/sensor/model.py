@@ -19,12 +19,12 @@ the length 1. It is what depth images hold, and what noise is a function of.
 
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.sensor.forward import SUPPORT, beyond_likelihood, depth_of_deviation, surface_likelihood
 from taichi_mrf.sensor.polynomials import SensorNoise
 from taichi_mrf.sensor.rays import CameraRays
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, Template
 
 
 @dataclass(frozen=True)

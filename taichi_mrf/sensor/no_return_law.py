@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.types import F32, I32, Struct, Template
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.polynomials import SensorNoise
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, Struct, Template
 
 ENDLESS = 1e9
 """A depth that no ray comes to."""

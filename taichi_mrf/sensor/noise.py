@@ -74,9 +74,9 @@ class NoiseTable:
         return np.maximum(values[:, 0], LEAST_SIGMA_M).max(axis=0), values[:, 1].max(axis=0)
 
     def sensor(self, camera: Camera) -> "Sensor":
-        from taichi_mrf.kernels.resident import resident
         from taichi_mrf.sensor.model import Sensor
         from taichi_mrf.sensor.polynomials import PolynomialTable
+        from taichi_mrf.system.resident import resident
 
         table = PolynomialTable(resident(self.coefficients), self.patch, self.columns)
         return Sensor(camera.in_kernels(), table)
@@ -101,8 +101,8 @@ class ScaledNoiseTable:
         return np.maximum(largest, LEAST_SIGMA_M), bias
 
     def sensor(self, camera: Camera) -> "Sensor":
-        from taichi_mrf.kernels.resident import resident
         from taichi_mrf.sensor.polynomials import ScaledTable
+        from taichi_mrf.system.resident import resident
 
         sensor, patch = self.of.sensor(camera), 1 if self.scale.shape == camera.shape else max(camera.shape)
         parts = resident(self.scale.reshape(-1)), patch, self.scale.shape[1], self.added_m

@@ -5,10 +5,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, Struct, Template, Vec5
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array3, Struct, Template, Vec5
 
 SAME_SIGMA = 2**0.5
 """Pixels whose sigmas differ by no more than about this factor may share a ray."""

@@ -361,8 +361,8 @@ class RayTable(Stored):
 
     @cached_property
     def _in_kernels(self) -> "TableRays":
-        from taichi_mrf.kernels.resident import resident
         from taichi_mrf.sensor.rays import MovingTableRays, TableRays
+        from taichi_mrf.system.resident import resident
 
         table = self.width, self.height, int(self.measures_range), resident(self._table.reshape(-1, 3))
         if self._origins is None:

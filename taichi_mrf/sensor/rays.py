@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, F32Array2, Vec3, Vec4
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array2, Vec3, Vec4
 
 
 @dataclass(frozen=True)

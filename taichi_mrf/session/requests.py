@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from taichi_mrf.runs.files import MAP_FILE, MESH_FILE, VOXEL_FILE
-from taichi_mrf.runs.folder import write_mesh_file, write_report, write_voxel_file
 from taichi_mrf.session.edits import Edit, Pair
 from taichi_mrf.session.extras import Extras
+from taichi_mrf.session.files import MAP_FILE, MESH_FILE, VOXEL_FILE
+from taichi_mrf.session.folder import write_mesh_file, write_report, write_voxel_file
 from taichi_mrf.session.ray_answers import pixel_answer, point_answer
 from taichi_mrf.session.run import Run
 from taichi_mrf.viewer.messages import (

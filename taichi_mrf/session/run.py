@@ -17,13 +17,12 @@ from taichi_mrf.methods.capabilities import (
     can_freeze,
     has_messages,
     measures_surface,
-    takes_colors,
     window_of,
 )
 from taichi_mrf.methods.protocol import MapStatistics
-from taichi_mrf.runs.files import MAP_FILE
-from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.files import MAP_FILE
+from taichi_mrf.session.folder import RunFacts
 from taichi_mrf.session.link import Link
 from taichi_mrf.session.mapper import LiveKeyframe, Mapper
 from taichi_mrf.session.pictures import outlined
@@ -33,7 +32,6 @@ from taichi_mrf.session.shown_extras import lack_of_surface
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
-from taichi_mrf.voxels.layers import COLORS
 
 RATE_SECONDS = 5.0
 """Seconds over which the rates of keyframes and of frames are averaged."""
@@ -110,6 +108,7 @@ class Progress:
             mapper.edits.can_redo,
             self._arrivals(replay),
             lack_of_surface(mapper.map),
+            tuple(name for name, layer in mapper.map.pixel_layers.items() if layer),
         )
 
     def time_left(self, replay: Replay) -> str:
@@ -209,8 +208,6 @@ class Run(SessionCore):
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,
-                has_colors=takes_colors(m) and (self.source.config.color or m.has_colors),
-                layers=tuple(name for name in m.pixel_layers if name != COLORS),
                 has_surface=measures_surface(m),
                 counts_keyframes=has_messages(m),
                 has_frames=self.source.new_replay is not None,

@@ -26,7 +26,7 @@ from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
-from taichi_mrf.runs.noise import noise_notes
+from taichi_mrf.session.noise import noise_notes
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file, is_folder

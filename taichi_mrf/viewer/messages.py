@@ -60,10 +60,6 @@ class Hello(Update):
     """True if the map's method can freeze keyframes."""
     has_dates: bool = False
     """True if the map can be shown as of another time."""
-    has_colors: bool = False
-    """True if voxels have the colours that cameras saw."""
-    layers: tuple[str, ...] = ()
-    """Names of other layers that pixels feed, of which frames may tell (voxels/layers.py)."""
     has_surface: bool = False
     """True if the map can make the surface that its keyframes measured."""
     counts_keyframes: bool = True
@@ -187,7 +183,8 @@ class Status(Update):
     pace (0: as fast as possible), None where frames have none. ``free_space`` says how sure free space is, if
     frames were held out for that. ``can_undo``, ``can_redo``: edits can be taken back, or made again.
     ``arrivals`` says how the frames of a sensor that runs come, empty for any other source; ``no_surface``
-    why no surface can be made of the map, empty if one can."""
+    why no surface can be made of the map, empty if one can. ``layers`` are those that pixels have fed
+    (voxels/layers.py)."""
 
     activity: str
     share: float
@@ -208,6 +205,7 @@ class Status(Update):
     can_redo: bool = False
     arrivals: str = ""
     no_surface: str = ""
+    layers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Blending inside kernels, as voxels/distance_field.py has it: one voxel's sums with those around it."""
 
-from taichi_mrf.kernels.types import I32, IVec3, Template, Vec2
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, IVec3, Template, Vec2
 from taichi_mrf.voxels.distance_field import BLENDED_BELOW
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.types import F32, I32, F32Array3, I32Array, IVec3, Template, Vec3
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import F32, I32, F32Array3, I32Array, IVec3, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.traversal import within

@@ -5,9 +5,9 @@ more than what is done to a voxel, and neighbouring voxels share cache lines. On
 thread, and neighbouring threads should take neighbouring voxels.
 """
 
-from taichi_mrf.kernels.types import I32, I32Array, IVec3, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, I32Array, IVec3, Template
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 

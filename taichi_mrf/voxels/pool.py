@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import strip_begin, strip_length
 

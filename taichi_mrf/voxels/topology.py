@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.types import F64, I32, AnyArray, AnyArray2, I32Array, IVec3, IVec4, Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F64, I32, AnyArray, AnyArray2, I32Array, IVec3, IVec4, Template
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 

@@ -11,9 +11,9 @@ origin + t * direction; t is axial depth or range, as the direction has it.
 
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Mat3, Struct, Template, Vec3
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, I32Array, IVec3, Mat3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 

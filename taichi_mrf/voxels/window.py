@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.resident import Resident
-from taichi_mrf.kernels.types import I32, I32Array, IVec3
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.resident import Resident
+from taichi_mrf.system.types import I32, I32Array, IVec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint

@@ -33,10 +33,10 @@ from taichi_mrf.evaluation.noise_fit import (
     enough_of,
 )
 from taichi_mrf.mapping.pipeline import map_sequence
-from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
 from taichi_mrf.sensor.stored import stored_arrays
+from taichi_mrf.session.noise import noise_notes
 from taichi_mrf.system.atomic import write_npz
 
 VOXEL = 0.05

@@ -23,8 +23,8 @@ from console import (
 )
 from small_scenes import make_data, make_redwood
 
+from taichi_mrf.evaluation.experiments.table3 import PAPER
 from taichi_mrf.evaluation.tables import entry_text
-from taichi_mrf.experiments.table3 import PAPER
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system import runtime
 

@@ -64,7 +64,7 @@ def test_every_folder_of_images_may_have_them(tmp_path: Path, name: str) -> None
     for frame, labels in zip(open_dataset(folder).frame_names, written, strict=True):
         write_image(folder / LABELS / f"{frame}.png", labels)
     dataset = open_dataset(folder, color=False)
-    assert "labels: from the images in labels/" in dataset.notes
+    assert "kinds: from the images in kinds/" in dataset.notes
     for frame, labels in zip(dataset, written, strict=True):
         np.testing.assert_array_equal(frame.images[LABELS], labels)
 

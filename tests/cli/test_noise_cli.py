@@ -18,7 +18,7 @@ from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.noise_fit import SigmaLaw
-from taichi_mrf.runs import folder
+from taichi_mrf.session import folder
 from taichi_mrf.tune.working_set import read_working_set
 from taichi_mrf.viewer.tune.messages import FrameChoice
 

@@ -9,7 +9,7 @@ from two_days import TODAY as TODAY_FRAMES
 from two_days import recorded, turned_away
 
 import taichi_mrf as tm
-from taichi_mrf.runs.files import MAP_FILE, REPORT_FILE
+from taichi_mrf.session.files import MAP_FILE, REPORT_FILE
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from taichi_mrf.experiments.scenes import coffin_scene
+from taichi_mrf.evaluation.experiments.scenes import coffin_scene
 from taichi_mrf.geometry.poses import look_at
 
 HEIGHT, WIDTH, PATCHES = 48, 64, 768

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taichi_mrf.inference.first_occupied import NEVER, left_alone, message, next_ahead, next_behind
-from taichi_mrf.kernels.types import I32, F32Array, Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, F32Array, Template
 
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.inference.accumulators import LONGEST, add_message, finest_scale, length_sum, mean_message
-from taichi_mrf.kernels.types import F32, F32Array, I32Array, I64Array
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array, I32Array, I64Array
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 from taichi_mrf.voxels.window import Window
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from taichi_mrf.config.sections import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.dated import in_time
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.log_odds import faded
-from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.types import F32, F32Array
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.log_odds import faded
 
 STEP_S = 4.0
 """Seconds between the frames of the tests."""

@@ -22,13 +22,13 @@ from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
 from taichi_mrf.inference.ray_list import RayBundler, block_ray, end_of_shared_path
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, Struct, Template, Vec3
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, I32Array, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

@@ -30,14 +30,14 @@ from taichi_mrf.config.sections import InferenceConfig, TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.prior import prior_probability
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32Array
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.no_return import NoReturnLaw
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.types import F32Array
 
 pytestmark = pytest.mark.usefixtures("backend")
 

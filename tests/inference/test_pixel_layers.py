@@ -223,9 +223,9 @@ def test_wrong_images_are_refused() -> None:
     depth, _ = scene.view(0.0)
     good = np.ones(scene.CAMERA.shape, np.uint8)
     for name, wrong, said in (
-        (LABELS, good[1:], "the image labels must be uint8 of the shape"),
-        (LABELS, good.astype(float), "the image labels must be uint8"),
-        ("heat", good, "no layer follows from an image 'heat': there are color, labels"),
+        (LABELS, good[1:], "the image kinds must be uint8 of the shape"),
+        (LABELS, good.astype(float), "the image kinds must be uint8"),
+        ("heat", good, "no layer follows from an image 'heat': there are color, kinds"),
     ):
         with pytest.raises(KeyframeError, match=said):
             m.add_keyframe(depth, scene.pose(0.0), scene.CAMERA, images={name: wrong})
@@ -308,7 +308,7 @@ def test_the_page_colours_voxels_by_it_with_a_legend(monkeypatch: pytest.MonkeyP
         for key in store.chunks:
             shown = store.shown(key, 0.0, None)
             centres_m = (shown.cells + np.array(key) * 64 + 0.5) * scene.VOXEL
-            colors = look.paint(shown, shown.cells, scene.VOXEL, np.zeros(3), facing(shown.cells))
+            colors = look.paint(shown, centres_m, facing(shown.cells))
             seen |= {(name, *at): rgb for at, rgb in zip(centres_m.tolist(), colors.tolist(), strict=True)}
         legend = legend_html(look.scale)
         assert ("class 7" in legend and PAGE.caption in legend) == (name == PAGE.coloring)

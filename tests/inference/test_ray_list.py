@@ -18,10 +18,10 @@ from taichi_mrf.inference.ray_list import (
     rays_per_voxel,
     stride_metres,
 )
-from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.resident import on_host
 
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 

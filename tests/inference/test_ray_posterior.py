@@ -13,12 +13,12 @@ from oracles.forward import Noise
 from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
-from taichi_mrf.kernels.types import F32, I32, F32Array, Template
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, Template
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import WindowIndex
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from small_room import build, probes
 
 from taichi_mrf.inference.workers import Workers
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, I32Array
 
 pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 

@@ -21,8 +21,8 @@ from taichi_mrf.mapping.onto import Placed, freeze_all, locate, parameters_onto,
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.runs.report import run_report
 from taichi_mrf.sensor.motion import AccelerationSamples, GyroSamples
+from taichi_mrf.session.report import run_report
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 

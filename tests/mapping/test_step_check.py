@@ -10,9 +10,9 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.step_check import StepCheck, check_steps
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.runs.report import run_report
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.session.report import run_report
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 

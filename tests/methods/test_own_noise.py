@@ -21,9 +21,6 @@ from taichi_mrf.config.sections import InferenceConfig
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.ray_list import RayBundler, block_of
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.resident import on_host
-from taichi_mrf.kernels.types import I32, AnyArray, I32Array
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.map_file import StoredKeyframe
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -34,6 +31,9 @@ from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.sensor.pose_doubt import covariance_of
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.resident import on_host
+from taichi_mrf.system.types import I32, AnyArray, I32Array
 from taichi_mrf.tune.trial import judge
 from taichi_mrf.viewer.messages import Switch
 

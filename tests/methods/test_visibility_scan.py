@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from oracles import visibility as reference
 
 from taichi_mrf.config.sections import VisibilityConfig
-from taichi_mrf.kernels.types import F32, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import TABLE_I
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array, I32Array, Vec4
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space
 from taichi_mrf.voxels.window import Window, WindowIndex

@@ -13,8 +13,6 @@ from oracles import wavemap as reference
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.config.sections import WavemapConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.methods.wavemap.map import WavemapMap
 from taichi_mrf.methods.wavemap.model import BeamModel, cumulative
 from taichi_mrf.queries.points import UNKNOWN
@@ -22,6 +20,8 @@ from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.types import F32, F32Array
 
 pytestmark = pytest.mark.usefixtures("backend")
 

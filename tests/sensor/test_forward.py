@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from oracles import forward as oracle
 from oracles.forward import Noise
 
-from taichi_mrf.kernels.types import I32, AnyArray, F32Array, Template, Vec5
 from taichi_mrf.sensor.forward import (
     AUTO,
     CENTRE,
@@ -27,6 +26,7 @@ from taichi_mrf.sensor.forward import (
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
 from taichi_mrf.sensor.polynomials import PixelNoise
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, AnyArray, F32Array, Template, Vec5
 
 # Written out, and not imported: these tests hold the values.
 SUPPORT = 6.5

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import I32, AnyArray
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import (
     LEAST_SIGMA_M,
@@ -30,7 +28,9 @@ from taichi_mrf.sensor.noise import (
     without_bias,
 )
 from taichi_mrf.sensor.polynomials import SensorNoise
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import I32, AnyArray
 
 CAMERA = PinholeCamera(width=50, height=37, fx=40, fy=40, cx=24.5, cy=18)
 """With patches of 16 pixels it has 4 columns and 3 rows, the last ones cut off by the image's edge."""

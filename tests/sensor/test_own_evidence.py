@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 from plugged_noise import PixelNoise, SquareNoise
 
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32Array2, F32Array3
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise, WidenedNoise
 from taichi_mrf.sensor.own_evidence import OwnEvidence, checked_evidence, sigma_of_confidence
 from taichi_mrf.sensor.polynomials import SensorNoise
+from taichi_mrf.system.bundles import kernel
+from taichi_mrf.system.types import F32Array2, F32Array3
 
 # Written out, and not imported: these tests hold the values.
 LEAST_SIGMA_M = 0.001

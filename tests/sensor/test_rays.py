@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import AnyArray, F32Array2, F32Array3
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.sensor.spherical import SphericalCamera
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import AnyArray, F32Array2, F32Array3
 
 pytestmark = pytest.mark.usefixtures("backend")
 

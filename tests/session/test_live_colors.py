@@ -8,7 +8,8 @@ from live_scene import CONFIG, FakeLink, finished, session_of
 
 from taichi_mrf.queries.colored import shown_colors_in
 from taichi_mrf.session.outbox import Outbox
-from taichi_mrf.viewer.messages import BrickColors, Hello, Switch, Watch
+from taichi_mrf.viewer.messages import BrickColors, Status, Switch, Watch
+from taichi_mrf.voxels.layers import COLORS
 from taichi_mrf.voxels.layout import grid_keys
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -21,7 +22,8 @@ def test_the_page_gets_the_colours_of_the_map_when_it_shows_them() -> None:
     link = FakeLink()
     session = session_of(link, config=COLORED)
     finished(session)
-    assert link.of_type(Hello)[0].has_colors
+    assert not link.of_type(Status)[0].layers
+    assert link.of_type(Status)[-1].layers == (COLORS,)
     assert not link.of_type(BrickColors)
     for edit in ((PHOTO,), (Switch(1, on=False),), (Switch(1, on=True),)):
         link.ask(*edit)
@@ -48,7 +50,7 @@ def test_a_run_without_colours_has_none() -> None:
     m = finished(session)
     session._extras.work(lambda step: True)
     assert not m.has_colors
-    assert not link.of_type(Hello)[0].has_colors
+    assert not link.of_type(Status)[-1].layers
     assert not link.of_type(BrickColors)
 
 

@@ -34,8 +34,8 @@ from taichi_mrf.mapping import rounds
 from taichi_mrf.mapping.loops import Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.runs.files import TRAJECTORY_FILE
-from taichi_mrf.runs.folder import write_run
+from taichi_mrf.session.files import TRAJECTORY_FILE
+from taichi_mrf.session.folder import write_run
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy

@@ -1,8 +1,8 @@
 """Kernels that only one test launches, each."""
 
-from taichi_mrf.kernels import bundles  # noqa: F401 (launches are watched)
-from taichi_mrf.kernels.types import F32Array
+from taichi_mrf.system import bundles  # noqa: F401 (launches are watched)
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32Array
 
 
 @ti.kernel

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.pixel_pass import PixelVisitor, add_pair
 from taichi_mrf.inference.ray_list import block_of
-from taichi_mrf.kernels.resident import on_host
-from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import on_host
+from taichi_mrf.system.types import F32, I32, Template
 from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layers import FromPixels, Layer, OnPage
 
@@ -23,7 +23,7 @@ PALETTE = np.array([[30 * n, 255 - 30 * n, 40] for n in range(1, CLASSES + 1)], 
 STEPS = 8.0
 """Steps of a class's sum for each pixel."""
 
-LABELS = "labels"
+LABELS = "kinds"
 PAGE = OnPage(
     "what it is", "which class a voxel has.", "the likeliest class", "label_layer:painted",
     tuple((f"class {n}", tuple(PALETTE[n - 1].tolist())) for n in range(1, CLASSES + 1)),

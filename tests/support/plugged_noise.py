@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.kernels.resident import resident
-from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import Curves, StoredNoise
 from taichi_mrf.sensor.polynomials import SensorNoise
 from taichi_mrf.sensor.stored import Arrays
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import resident
+from taichi_mrf.system.types import F32, I32, F32Array, Struct, Template
 
 # ruff: noqa: ANN201, ANN202 - Taichi does not allow `-> None` on a kernel or a func.
 

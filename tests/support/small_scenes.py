@@ -16,8 +16,8 @@ import trimesh
 from taichi_mrf.datasets.synthetic.analytic_render import render
 from taichi_mrf.datasets.synthetic.analytic_scene import Point, Scene, Solid
 from taichi_mrf.datasets.synthetic.mesh_scene import scene_mesh
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Ledger
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Ledger
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.simulate import KINECT_1, simulate

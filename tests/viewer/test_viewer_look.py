@@ -32,6 +32,7 @@ from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
 from taichi_mrf.voxels.colors import NO_COLOR
 
 HEIGHTS = (0.0, 2.0)
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
@@ -46,7 +47,7 @@ def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
 def scale_of(name: str, *some: Shown, heights_m: tuple[float, float] = HEIGHTS) -> Scale:
     """The scale of a colouring for a map that has these voxels, all at height 0."""
     measure = COLORINGS[name].voxels
-    numbers = [measure.of(each, np.zeros(len(each.cells))) for each in some]
+    numbers = [measure.of(each, np.zeros((len(each.cells), 3)), UP) for each in some]
     return measure.scale(np.concatenate(numbers or [np.zeros(0)]), heights_m)
 
 
@@ -57,13 +58,13 @@ def test_chances_have_their_colours_and_those_between_are_blended() -> None:
     chances = {0.5: (240, 110, 40), 0.9: (247, 190, 95), 0.99: (150, 200, 180), 0.999: (60, 140, 190)}
     p = np.array(list(chances))
     scale = scale_of("marginal probability", LIKELY)
-    colors = scale.paint(shown(np.log(p / (1 - p))), np.zeros(4)).astype(int)
+    colors = scale.paint(shown(np.log(p / (1 - p))), np.zeros((4, 3)), UP).astype(int)
     # 256 colours, and the log-odds are rounded to 1/512.
     assert np.abs(colors - list(chances.values())).max() <= 2
-    between = scale.paint(shown(np.array([1.0986])), np.zeros(1)).astype(int)  # 3 in 4
+    between = scale.paint(shown(np.array([1.0986])), np.zeros((1, 3)), UP).astype(int)  # 3 in 4
     assert np.abs(between - (colors[0] + colors[1]) / 2).max() <= 2
     unlikely = scale_of("marginal probability", UNLIKELY)
-    assert np.abs(unlikely.paint(shown(np.zeros(1)), np.zeros(1)).astype(int) - colors[0]).max() <= 2
+    assert np.abs(unlikely.paint(shown(np.zeros(1)), np.zeros((1, 3)), UP).astype(int) - colors[0]).max() <= 2
 
 
 def test_the_legend_of_chances_reads_in_chances() -> None:
@@ -76,7 +77,7 @@ def test_the_legend_of_chances_reads_in_chances() -> None:
 def test_the_scale_reaches_down_when_improbable_voxels_are_shown() -> None:
     assert scale_of("marginal probability", LIKELY).low == 0.0
     low = scale_of("marginal probability", UNLIKELY)
-    dark = low.paint(shown(np.array([-20.0])), np.zeros(1))
+    dark = low.paint(shown(np.array([-20.0])), np.zeros((1, 3)), UP)
     np.testing.assert_array_equal(dark[0], low.colors[0])
 
 
@@ -86,7 +87,7 @@ def test_uncertainty_is_brightest_at_one_half_and_its_ends_are_where_the_values_
     p = 1 / (1 + np.exp(-log_odds))
     entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))  # 1, 0.84, 0.84 and 0.0105 bits
     assert (scale.low, scale.high) == (0.06, 1.0)  # two in a hundred lie below: 0.0603 bits
-    colors = scale.paint(shown(log_odds), np.zeros(4))
+    colors = scale.paint(shown(log_odds), np.zeros((4, 3)), UP)
     share = np.log(np.maximum(entropy, scale.low) / scale.low) / np.log(scale.high / scale.low)
     expected = scale.colors[np.rint(255 * share).astype(int)].astype(int)
     assert np.abs(colors - expected).max() <= 2
@@ -99,7 +100,7 @@ def test_keyframes_are_counted_on_a_logarithmic_scale_up_to_the_most_that_there_
     seen = np.array([0, 1, 9, 81, 90])
     scale = scale_of("keyframes that see it", shown(np.zeros(5), seen))
     assert (scale.low, scale.high) == (1.0, 90.0)
-    colors = scale.paint(shown(np.zeros(5), seen), np.zeros(5))
+    colors = scale.paint(shown(np.zeros(5), seen), np.zeros((5, 3)), UP)
     steps = [0, 0, *(round(255 * math.log(many) / math.log(90)) for many in (9, 81)), 255]
     np.testing.assert_array_equal(colors, scale.colors[steps])
     assert scale_of("keyframes that see it").high == 2.0
@@ -107,7 +108,7 @@ def test_keyframes_are_counted_on_a_logarithmic_scale_up_to_the_most_that_there_
 
 def test_heights_run_over_the_map() -> None:
     scale = scale_of("height", heights_m=(1.0, 3.0))
-    colors = scale.paint(shown(np.zeros(3)), np.array([1.0, 2.0, 3.0]))
+    colors = scale.paint(shown(np.zeros(3)), np.array([[9.0, 0, 1], [8, 0, 2], [7, 5, 3]]), UP)
     np.testing.assert_array_equal(colors, scale.colors[[0, 128, 255]])
     assert re.findall("<span>(.*?)</span>", legend_html(scale))[::2] == ["0", "2"]
 
@@ -136,13 +137,13 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     assert not len(store.shown((0, 0, 0), 0.0, None).cells)
     assert store.put(bricks, log_odds=np.full((3, 512), 100, np.int16), seen=np.ones((3, 512), np.uint8))
     seen = store.shown((0, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(scale.paint(seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
+    np.testing.assert_array_equal(scale.paint(seen, np.zeros((1024, 3)), UP), colors[:2].reshape(-1, 3))
     unseen = store.shown((1, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(scale.paint(unseen, np.zeros(512)), np.full((512, 3), NO_COLOR))
+    np.testing.assert_array_equal(scale.paint(unseen, np.zeros((512, 3)), UP), np.full((512, 3), NO_COLOR))
     assert "grey where none did" in legend_html(scale)
     store.remove(bricks[:1])
     left = store.shown((0, 0, 0), 0.0, None)
-    np.testing.assert_array_equal(scale.paint(left, np.zeros(512)), colors[1])
+    np.testing.assert_array_equal(scale.paint(left, np.zeros((512, 3)), UP), colors[1])
 
 
 @pytest.mark.parametrize("name", COLORINGS)

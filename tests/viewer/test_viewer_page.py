@@ -23,6 +23,7 @@ from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Dragged
 from taichi_mrf.viewer.scene.base_panel import Joined, Used
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
+from taichi_mrf.voxels.layers import COLORS
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
@@ -223,7 +224,7 @@ def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: Live
     offered = handled.page.panel.view_options.handles["color_by"]
     assert "keyframes that see it" in offered.options
     assert "photo" not in offered.options
-    handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
+    handled.take(replace(HELLO, counts_keyframes=False), replace(DONE, layers=(COLORS,)))
     assert "keyframes that see it" not in offered.options
     assert "photo" in offered.options
 

@@ -19,7 +19,7 @@ from taichi_mrf.viewer.scene.base_panel import OptionsMoved
 from taichi_mrf.viewer.scene.coloring import COLORINGS, Coloring, Measure, legend_html
 from taichi_mrf.viewer.scene.surface_layer import before_tone_mapping, unlit_glb
 from taichi_mrf.viewer.scene.view_options import ViewOptions
-from taichi_mrf.voxels.layers import LAYERS, FromPixels, Layer, OnPage
+from taichi_mrf.voxels.layers import COLORS, LAYERS, FromPixels, Layer, OnPage
 
 VOXEL = 0.1
 HELLO = m.Hello(
@@ -31,7 +31,6 @@ HELLO = m.Hello(
     -2.2,
     0.1,
     "voxel_size: 0.1",
-    has_colors=True,
     has_surface=True,
 )
 DONE = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
@@ -203,8 +202,7 @@ def test_the_page_opens_in_the_colours_of_photographs_where_the_picture_does() -
         for chosen, expected in (("height", "photo"), ("uncertainty", "uncertainty"), ("height", "photo")):
             widget = running.page.panel.view_options.handles["color_by"]
             widget.value = chosen
-            running.take(replace(HELLO, has_colors=True))
-            running.take(replace(VIEW, photo=True))
+            running.take(HELLO, replace(DONE, layers=(COLORS,)), replace(VIEW, photo=True))
             assert widget.value == expected
         widget.value = "height"
         running.take(replace(VIEW, photo=True))
@@ -317,10 +315,10 @@ def test_a_layer_that_pixels_feed_is_a_colouring_of_the_page(monkeypatch: pytest
     try:
         widget = running.page.panel.view_options.handles["color_by"]
         assert name not in widget.options
-        running.take(replace(HELLO, layers=("heat",), has_colors=False))
+        running.take(HELLO, replace(DONE, layers=("heat",)))
         assert name in widget.options
         assert "photo" not in widget.options
-        running.take(replace(HELLO, layers=("heat",)), BRICK)
+        running.take(replace(DONE, layers=("heat", COLORS)), BRICK)
         assert "photo" in widget.options
         widget.value = name
         running.draw(color_by=name, draw_as="voxels", shade=False)
@@ -333,14 +331,20 @@ def test_a_layer_that_pixels_feed_is_a_colouring_of_the_page(monkeypatch: pytest
             (sent,) = running.page.map.layers["map"]._sent.values()
             assert (sent.colors == level).all()
             assert ("an oven" in running.page.panel._legend.content) == (each == name)
+        running.take(HELLO, replace(DONE, voxels=0))  # begun again: its frames may bring what was chosen
+        assert (widget.value, "photo" in widget.options) == (name, False)
+        running.take(DONE)
+        assert (widget.value, name in widget.options) == ("height", False)
     finally:
         running.server.stop()
 
 
 def test_an_entry_of_the_table_is_a_colouring_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its name in the list with its help, its colours on voxels and surface, its legend, and its data."""
-    of_z = Measure("place in the chunk", lambda shown, heights_m: shown.cells[:, 2], lambda low, high: GREYS)
-    of_x = Measure("metres along x", lambda patch, heights_m: patch.vertices_m[:, 0], lambda low, high: GREYS)
+    of_z = Measure(
+        "place in the chunk", lambda shown, points_m, up: shown.cells[:, 2], lambda low, high: GREYS
+    )
+    of_x = Measure("metres along x", lambda patch, points_m, up: points_m[:, 0], lambda low, high: GREYS)
     monkeypatch.setitem(COLORINGS, "place", Coloring("where in its chunk.", of_z, of_x, needs="counts"))
     running = SurfacePage()
     try:
@@ -362,6 +366,29 @@ def test_an_entry_of_the_table_is_a_colouring_of_the_page(monkeypatch: pytest.Mo
         assert "metres along x" in running.page.panel._legend.content
         running.take(replace(HELLO, counts_keyframes=False))
         assert "place" not in widget.options
+    finally:
+        running.server.stop()
+
+
+def test_a_colouring_of_positions_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its numbers are those of the voxels' centres, and of the surface's vertices."""
+    far = Measure(
+        "metres from the origin",
+        lambda known, points_m, up: np.linalg.norm(points_m, axis=1),
+        lambda low, high: GREYS,
+        ends=lambda numbers, heights_m: (0.0, 10.0),
+    )
+    monkeypatch.setitem(COLORINGS, "far", Coloring("how far it is.", far))
+    running = SurfacePage()
+    try:
+        running.draw(color_by="far", draw_as="voxels", shade=False)
+        (sent,) = running.page.map.layers["map"]._sent.values()
+        away_m = np.linalg.norm((sent.cells + 0.5) * VOXEL, axis=1)
+        assert np.abs(sent.colors[:, 0] - 25.5 * away_m).max() <= 0.51
+        running.take(patch(), VIEW)
+        running.draw(color_by="far", shade=False)
+        away_m = np.linalg.norm(patch().vertices_m, axis=1)
+        assert np.abs(running.mesh()[2][:, 0] - 25.5 * away_m).max() <= 1.5
     finally:
         running.server.stop()
 

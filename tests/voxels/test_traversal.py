@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from oracles.traversal import clip_to_box, segments
 
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_bricks, walk_voxels
 

@@ -15,9 +15,9 @@ from taichi_mrf.cluster.submaps.rounds import SETTLED, SubmapsResult, map_in_sub
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.corridor import NAME, floor_area_m2
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap

@@ -11,10 +11,10 @@ from benchmarks.lab.poses import aligned
 from benchmarks.lab.trajectory.walks import HOLD_OUT, Walk
 from benchmarks.lab.trajectory_error import step_errors, trajectory_error
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, VolumeConfig
-from taichi_mrf.experiments.contenders import mrf
-from taichi_mrf.experiments.judging import judge_all
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.evaluation.experiments.contenders import mrf
+from taichi_mrf.evaluation.experiments.judging import judge_all
+from taichi_mrf.evaluation.experiments.ledger import Result
+from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.pipeline import Event, map_sequence

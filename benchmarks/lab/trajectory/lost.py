@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from benchmarks.lab.trajectory.following import map_figures
 from benchmarks.lab.trajectory.walks import HOLD_OUT, CameraPath, Walk, ring_walk, room_walk, small_camera
 from taichi_mrf.config.schema import Config
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.selection import is_held_out

@@ -31,9 +31,9 @@ from benchmarks.lab.trajectory.walks import (
 )
 from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
 
 COLUMNS = [
     "walk", "voxels", "poses by", "moves (cm)", "turns (deg)", "frames", "lost", "RMS (cm)", "anchored (cm)",

@@ -30,7 +30,7 @@ from taichi_mrf.datasets.synthetic.corridor import (
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
 from taichi_mrf.datasets.synthetic.rendered_sequence import RenderOptions, mottled
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
-from taichi_mrf.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.folds import Experiment
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -17,8 +17,8 @@ from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
-from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE
-from taichi_mrf.runs.report import report_json
+from taichi_mrf.session.files import CONFIG_FILE, MAP_FILE, REPORT_FILE
+from taichi_mrf.session.report import report_json
 from taichi_mrf.system.atomic import write_text
 
 MAY_CHANGE = (

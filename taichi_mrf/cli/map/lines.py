@@ -12,8 +12,8 @@ from taichi_mrf.cli.shared.terminal import DID_NOT_FIT, READ_WRONG, Terminal, pr
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses
 from taichi_mrf.mapping.rounds import RoundStep
-from taichi_mrf.runs.files import MAP_FILE, VOXEL_FILE
-from taichi_mrf.runs.report import report_json
+from taichi_mrf.session.files import MAP_FILE, VOXEL_FILE
+from taichi_mrf.session.report import report_json
 
 OPEN_VOXELS = "Look at the .png files, or open voxels.ply in MeshLab, CloudCompare or Blender. "
 KEPT = "The files are kept; --force ends without this error."

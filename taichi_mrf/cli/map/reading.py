@@ -18,8 +18,8 @@ from taichi_mrf.mapping.onto import freeze_all, placed_in
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
-from taichi_mrf.runs.files import CONFIG_FILE
-from taichi_mrf.runs.noise import contradicts
+from taichi_mrf.session.files import CONFIG_FILE
+from taichi_mrf.session.noise import contradicts
 
 
 def open_recording(task: MapTask) -> tuple[Dataset, Config]:

@@ -47,7 +47,7 @@ from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ClusterError, ReadWrongError, TaichiMRFError
 from taichi_mrf.evaluation.pictures.figures import write_contact_sheet
-from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
+from taichi_mrf.session.files import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.system.atomic import write_text
 
 MapOne = Callable[[MapTask, ProgressBar, StopRequest], tuple[dict[str, Any], list[Path]]]

@@ -18,8 +18,8 @@ from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.registry import absolute_source
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
-from taichi_mrf.runs.report import report_json
+from taichi_mrf.session.files import CONFIG_FILE, REPORT_FILE
+from taichi_mrf.session.report import report_json
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import VOXELS

@@ -22,7 +22,7 @@ from taichi_mrf.mapping.onto import parameters_onto
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import config_in_memory
 from taichi_mrf.methods.map_file import open_map_file, read_header
-from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
+from taichi_mrf.session.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 from taichi_mrf.system import runtime
 
 LEARNT = ("sensor.sigma_scale", "sensor.sigma_added", "inference.surface_density", "inference.outlier_floor")

@@ -15,7 +15,7 @@ from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.sections import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.runs.files import CONFIG_FILE
+from taichi_mrf.session.files import CONFIG_FILE
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.types import F32, I32, AnyArray, Mat3, Template, Vec3, Vec4
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, Mat3, Template, Vec3, Vec4
 
 BOX, SPHERE = KINDS.index("box"), KINDS.index("sphere")
 NOTHING = 1e30

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose, inverse
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import (
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.bundles import Bundle, kernel
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import (
     F32,
     I32,
     F32Array,
@@ -26,8 +28,6 @@ from taichi_mrf.kernels.types import (
     Template,
     Vec3,
 )
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR
 
 _OVERLAP = 1e-5

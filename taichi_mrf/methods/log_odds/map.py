@@ -25,20 +25,6 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import (
-    F32,
-    I32,
-    F32Array,
-    F32Array2,
-    I32Array,
-    I64Array,
-    IVec3,
-    Struct,
-    Template,
-    Vec3,
-    Vec4,
-)
 from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.log_odds.plug import METHOD
 from taichi_mrf.methods.log_odds.ray_ends import (
@@ -56,8 +42,22 @@ from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array2,
+    I32Array,
+    I64Array,
+    IVec3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+)
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.pool import BrickPool

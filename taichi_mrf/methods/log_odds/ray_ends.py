@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import visible_box
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, Template, Vec3, Vec4
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import origins_of
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array2, Template, Vec3, Vec4
 from taichi_mrf.voxels.traversal import Viewpoint, ray_start
 from taichi_mrf.voxels.window import Window
 

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.surface_votes import CALLED
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Template, Vec3
 from taichi_mrf.voxels.blended_field import blended, cell_of, voxel_around
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import VOXELS, grid_keys, rows_around

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, F32Array, I32Array
 from taichi_mrf.queries.changed_things import Surfaces, stands_clear
+from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, F32Array, I32Array
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.numbering import strip_length
 from taichi_mrf.voxels.pool import BrickPool, copied, write_bricks

@@ -16,14 +16,14 @@ largest is used. A voxel is hidden only if it is hidden from all rays, so the la
 from dataclasses import dataclass
 from statistics import NormalDist
 
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.methods.recursive_update import updated
 from taichi_mrf.sensor.forward import SUPPORT, normal_tail
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.bundles import Bundle, kernel
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.log_odds import logistic
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 

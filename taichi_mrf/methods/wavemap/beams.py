@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.resident import resident
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec4, Template, Vec3
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.sensor.origins import points_at
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.resident import resident
+from taichi_mrf.system.types import F32, I32, F32Array, F32Array2, I32Array, IVec4, Template, Vec3
 
 LEAST_STEP_RAD = math.radians(0.4)
 """Bins of beams are no finer than this: to look into an empty one takes as long as to look at a beam."""

@@ -20,8 +20,17 @@ from taichi_mrf.config.sections import TimeConfig, WavemapConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import (
+from taichi_mrf.methods.brick_map import own_parameters, own_section
+from taichi_mrf.methods.recursive import RecursiveMap, Scan
+from taichi_mrf.methods.recursive_update import log_odds, updated
+from taichi_mrf.methods.wavemap.beams import NEIGHBOURS, Beams, beams_of, upright_axes, visit_near
+from taichi_mrf.methods.wavemap.model import BeamModel
+from taichi_mrf.methods.wavemap.plug import METHOD, REACH_SIGMAS
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.system.bundles import Bundle, kernel
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.types import (
     F32,
     I32,
     F32Array,
@@ -34,15 +43,6 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
-from taichi_mrf.methods.brick_map import own_parameters, own_section
-from taichi_mrf.methods.recursive import RecursiveMap, Scan
-from taichi_mrf.methods.recursive_update import log_odds, updated
-from taichi_mrf.methods.wavemap.beams import NEIGHBOURS, Beams, beams_of, upright_axes, visit_near
-from taichi_mrf.methods.wavemap.model import BeamModel
-from taichi_mrf.methods.wavemap.plug import METHOD, REACH_SIGMAS
-from taichi_mrf.sensor.noise import NoiseModel
-from taichi_mrf.system.compiler import ti
-from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.window import Window

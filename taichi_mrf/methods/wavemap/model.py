@@ -11,9 +11,9 @@ range_sigma, g = a / angle_sigma and C the cumulative distribution of an approxi
 
 from dataclasses import dataclass
 
-from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32
+from taichi_mrf.system.bundles import Bundle
 from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.types import F32, I32
 
 
 @ti.func

@@ -189,6 +189,8 @@ class Panel(BasePanel):
             past = "it is made of the map of now, and this is an earlier time" if self.time.is_past else ""
             later = "it is made at the end, or while paused" if moving else ""
             self.show_lack_of_surface(status.no_surface or past or later)
+        if status.voxels:
+            self.offer_colorings(h, status.layers)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
         if not (status.voxels or self._names):

@@ -6,7 +6,7 @@ thread takes them out. viser runs callbacks on a pool of threads: a callback onl
 """
 
 import queue
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -157,9 +157,14 @@ class BasePanel:
             change(slider, min=low, max=high, value=middle)
 
     def offer(self, hello: Hello) -> None:
-        """Offer the layers and colours that a map has the data for."""
-        self.view_options.offer("color_by", colorings_of(hello))
+        """Offer the drawings that a map has the data for, and the colours; the chosen ones may come yet."""
+        chosen = COLORINGS[self.view_options.handles["color_by"].value].layer
+        self.offer_colorings(hello, (chosen,))
         self.view_options.offer("draw_as", drawings_of(hello))
+
+    def offer_colorings(self, hello: Hello, layers: Container[str]) -> None:
+        """Offer the colourings that a map has the data for, of which pixels have fed ``layers``."""
+        self.view_options.offer("color_by", colorings_of(hello, layers))
 
     def show_used(self, **used: bool) -> None:
         """Show the widgets of these view options while they have an effect; explain the chosen colours."""

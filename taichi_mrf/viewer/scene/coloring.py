@@ -77,8 +77,8 @@ def _one_digit(number: float, rounded: Callable[[float], float]) -> float:
 @dataclass(frozen=True)
 class Measure:
     """What a colour says of voxels or vertices of the surface: their numbers ``of`` (what is known of them,
-    heights in metres, world) -> (n,), and the colours (256, 3) between two ends; or, without ``colors``,
-    colours (n, 3) themselves.
+    their points (n, 3) in metres, world, the unit vector up there) -> (n,), and the colours (256, 3) between
+    two ends; or, without ``colors``, colours (n, 3) themselves. A voxel's point is its centre.
 
     ``ends`` are made from some of the numbers, and from the lowest and the highest height of the map.
     ``logarithmic``: equal ratios are equal steps. ``marks`` are the legend's words between two ends, at even
@@ -86,7 +86,7 @@ class Measure:
     """
 
     label: str
-    of: Callable[[Any, Floats], NDArray]
+    of: Callable[[Any, Floats, Floats], NDArray]
     colors: Callable[[float, float], NDArray[np.uint8]] | None = None
     ends: Callable[[Floats, Ends], Ends] = spread
     logarithmic: bool = False
@@ -118,9 +118,9 @@ class Scale:
         made = self.measure.colors
         return np.zeros((0, 3), np.uint8) if made is None else made(self.low, self.high)
 
-    def paint(self, known: Any, heights_m: Floats) -> NDArray[np.uint8]:
-        """Colours (n, 3) of voxels or vertices."""
-        numbers = self.measure.of(known, heights_m)
+    def paint(self, known: Any, points_m: Floats, up: Floats) -> NDArray[np.uint8]:
+        """Colours (n, 3) of voxels or vertices at points (n, 3)."""
+        numbers = self.measure.of(known, points_m, up)
         if not len(self.colors):
             return numbers
         numbers, low, high = numbers.astype(np.float32), self.low, self.high
@@ -147,7 +147,7 @@ def _chances(log_odds: NDArray[np.int16]) -> Floats:
     return 1.0 / (1.0 + np.exp(-log_odds * LOG_ODDS_STEP))
 
 
-def _entropy(shown: Shown, heights_m: Floats) -> Floats:
+def _entropy(shown: Shown, points_m: Floats, up: Floats) -> Floats:
     p = np.clip(_chances(shown.log_odds), 1e-12, 1 - 1e-12)
     return -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
 
@@ -173,9 +173,9 @@ def _chance_marks(low: float, high: float) -> tuple[str, ...]:
 def _of_pixels(layer: str, page: OnPage) -> Coloring:
     """The colouring of a layer that pixels feed. Vertices have colours alone of their own."""
 
-    def painted(known: Any, heights_m: Floats) -> NDArray[np.uint8]:
+    def painted(known: Any, points_m: Floats, up: Floats) -> NDArray[np.uint8]:
         found = known.colors if layer == COLORS else known.layers.get(layer)
-        return np.full((len(heights_m), 3), NO_COLOR, np.uint8) if found is None else found
+        return np.full(points_m.shape, NO_COLOR, np.uint8) if found is None else found
 
     measure = Measure(page.caption, painted, key=page.key)
     return Coloring(page.help, measure, measure if layer == COLORS else None, "colors", layer)
@@ -184,12 +184,12 @@ def _of_pixels(layer: str, page: OnPage) -> Coloring:
 _HEIGHT_LABEL = "height above the lowest surface (m)"
 _HEIGHT = Measure(
     _HEIGHT_LABEL,
-    lambda known, heights_m: heights_m,
+    lambda known, points_m, up: points_m @ up,
     lambda low, high: ramp("Spectral_r"),
     ends=lambda numbers, heights_m: heights_m,
     marks=lambda low, high: ("0", _HEIGHT_LABEL, f"{high - low:.3g}"),
 )
-_PLAIN = Measure("", lambda known, heights_m: np.full((len(heights_m), 3), NO_COLOR, np.uint8))
+_PLAIN = Measure("", lambda known, points_m, up: np.full(points_m.shape, NO_COLOR, np.uint8))
 
 COLORINGS: dict[str, Coloring] = {
     "height": Coloring("how high it is above its lowest surface.", _HEIGHT, _HEIGHT),
@@ -197,7 +197,7 @@ COLORINGS: dict[str, Coloring] = {
         "how sure the map is that a voxel is occupied: orange where it is unsure, blue where it is sure.",
         voxels=Measure(
             "chance that a voxel is occupied",
-            lambda shown, heights_m: shown.log_odds * LOG_ODDS_STEP,
+            lambda shown, points_m, up: shown.log_odds * LOG_ODDS_STEP,
             _chance_colors,
             _chance_ends,
             marks=_chance_marks,
@@ -210,7 +210,7 @@ COLORINGS: dict[str, Coloring] = {
         ),
         surface=Measure(
             "uncertainty: standard deviation (cm)",
-            lambda patch, heights_m: 100.0 * patch.std_m,
+            lambda patch, points_m, up: 100.0 * patch.std_m,
             lambda low, high: ramp("magma", 50),
             logarithmic=True,
         ),
@@ -220,7 +220,7 @@ COLORINGS: dict[str, Coloring] = {
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
             "keyframes that see the voxel",
-            lambda shown, heights_m: shown.seen,
+            lambda shown, points_m, up: shown.seen,
             lambda low, high: ramp("plasma"),
             lambda numbers, heights_m: (1.0, max(float(numbers.max(initial=0.0)), 2.0)),
             logarithmic=True,

@@ -155,14 +155,14 @@ class SurfaceLayer:
         measure = look.coloring.surface
         if measure is None or measure is look.coloring.voxels:
             return look.scale
-        numbers = [measure.of(patch, patch.vertices_m @ look.up) for patch in self.patches.values()]
+        numbers = [measure.of(each, each.vertices_m, np.array(look.up)) for each in self.patches.values()]
         return measure.scale(np.concatenate(numbers or [np.zeros(0)]), look.heights_m)
 
     def _colors(self, patch: SurfacePatch, look: Look, scale: Scale) -> NDArray[np.uint8]:
         view = self.view
         assert view is not None  # until then nothing is drawn
         known = patch if look.coloring.surface else self._behind(patch)
-        colors = scale.paint(known, patch.vertices_m @ look.up)
+        colors = scale.paint(known, patch.vertices_m, np.array(look.up))
         if not look.shade:
             return colors
         lit = np.clip((patch.normals / 127.0) @ view.light, 0.0, 1.0)

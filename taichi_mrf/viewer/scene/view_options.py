@@ -3,13 +3,13 @@
 The page's widgets are made from the options: a field's docstring is its help text, its range the slider's.
 """
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from taichi_mrf.config.method import Range
 from taichi_mrf.viewer.messages import Hello
 from taichi_mrf.viewer.scene.coloring import COLORINGS
-from taichi_mrf.voxels.layers import COLORS
 
 Draw = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
@@ -93,10 +93,9 @@ OF_LAYER = {
 """Options that belong to another one, and stand indented below it."""
 
 
-def colorings_of(hello: Hello) -> tuple[str, ...]:
-    """The colourings that a map has the data for."""
-    layers = ("", *hello.layers, *[COLORS] * hello.has_colors)
-    fit = {name: c for name, c in COLORINGS.items() if c.layer in layers}
+def colorings_of(hello: Hello, layers: Container[str] = ()) -> tuple[str, ...]:
+    """The colourings that a map has the data for, of which pixels have fed these ``layers``."""
+    fit = {name: c for name, c in COLORINGS.items() if not c.layer or c.layer in layers}
     return tuple(name for name, c in fit.items() if c.needs != "counts" or hello.counts_keyframes)
 
 

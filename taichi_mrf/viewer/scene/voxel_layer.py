@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up, up_vector
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
@@ -153,13 +153,10 @@ class Look:
     """A unit vector in the world."""
 
     def paint(
-        self, shown: Shown, centres: NDArray, voxel_size: float, first_m: ArrayLike, facing: NDArray[np.uint8]
+        self, shown: Shown, centres_m: NDArray[np.floating], facing: NDArray[np.uint8]
     ) -> NDArray[np.uint8]:
-        """Colours (n, 3) of voxels whose surfaces face there, with centres (n, 3) in voxels from ``first_m``
-        (metres, world)."""
-        up_m = voxel_size * np.array(self.up, np.float32)
-        heights_m = centres.astype(np.float32) @ up_m + np.float32(np.dot(first_m, self.up))
-        colors = self.scale.paint(shown, heights_m)
+        """Colours (n, 3) of voxels with centres (n, 3) in the world, whose surfaces face there."""
+        colors = self.scale.paint(shown, centres_m, np.array(self.up, np.float32))
         return shaded(colors, facing) if self.shade else colors
 
 
@@ -266,8 +263,9 @@ class VoxelLayer:
             if before is not None:
                 self._prepared[key] = None
             return
-        first_m = (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size
-        colors = look.paint(shown, shown.cells, self._voxel_size, first_m, facing(shown.cells))
+        first_m = ((np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size).astype(np.float32)
+        centres_m = shown.cells * np.float32(self._voxel_size) + first_m
+        colors = look.paint(shown, centres_m, facing(shown.cells))
         colors[shown.is_earlier] = pale(colors[shown.is_earlier])
         dynamic = self._is_dynamic(key, shown.cells) & look.changes
         colors[dynamic] = DYNAMIC_COLOR
@@ -322,18 +320,18 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
     log_odds = float(np.log(options.threshold / (1 - options.threshold)))
     coloring = COLORINGS[options.color_by]
     some, centres = store.sample(log_odds)
-    their_heights_m = voxel_size * centres @ up_vector(up)
-    heights_m = _ends(their_heights_m, 2 * voxel_size)
+    centres_m, upward = voxel_size * centres, up_vector(up)
+    heights_m = _ends(centres_m @ upward, 2 * voxel_size)
     return Look(
         log_odds=log_odds,
         cut=cut_of(options, store, up, voxel_size),
         coloring=coloring,
-        scale=coloring.voxels.scale(coloring.voxels.of(some, their_heights_m), heights_m),
+        scale=coloring.voxels.scale(coloring.voxels.of(some, centres_m, upward), heights_m),
         heights_m=heights_m,
         point_size=options.size,
         shade=options.shade,
         changes=options.changes,
-        up=tuple(up_vector(up).tolist()),
+        up=tuple(upward.tolist()),
     )
 
 
