@@ -87,7 +87,7 @@ def add_cells(
             scene.add_point_cloud(
                 f"/cells/{key[0]}_{key[1]}_{key[2]}_{side}",
                 points=centres.astype(np.float16),
-                colors=look.paint(shown, centres, voxel_size, first_m, faces),
+                colors=look.paint(shown, (voxel_size * centres + first_m).astype(np.float32), faces),
                 point_size=side * look.point_size,
                 point_shape="square",
                 precision="float16",
