@@ -103,7 +103,7 @@ def view_images(
         pass
     else:
         verdict = judged.image
-        score = f"right {judged.score:.0%} within 1.5 sigma, no surface {judged.unanswered:.0%}"
+        score = f"{judged.score:.0%} right within 1.5 sigma, {judged.unanswered:.0%} without a surface"
     return Images(
         name,
         depth_colors(picture.image(measured), bounds),

@@ -133,7 +133,7 @@ def _verdict(packed: bytes) -> NDArray[np.uint8]:
 
 
 def _title(number: int, shown: tuple[bytes, float, float]) -> str:
-    return f"try {number}: right {shown[1]:.1%} within 1.5 voxels, no surface {shown[2]:.1%}"
+    return f"try {number}: {shown[1]:.1%} right within 1.5 voxels, {shown[2]:.1%} without a surface"
 
 
 def _step(image: NDArray[np.generic]) -> int:

@@ -1,5 +1,6 @@
 """The examples of docs/queries.md, pasted one after the other."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,8 @@ from pages import code_of
 from queried_maps import room_map
 
 import taichi_mrf
-from taichi_mrf.export.formats import FORMATS
+from taichi_mrf.cli.options.saved_maps import Export
+from taichi_mrf.export.formats import FORMATS, export_map
 from taichi_mrf.methods.mrf.reading import Layer
 
 
@@ -51,3 +53,12 @@ def test_the_examples_run_on_every_layer(
 def test_the_table_names_every_format(page: str) -> None:
     table = "\n".join(line for line in page.splitlines() if line.startswith("|"))
     assert all(f"`{extension}" in table for extension in FORMATS)
+
+
+def test_help_docstring_and_readme_name_every_format(repository: Path) -> None:
+    command = next(
+        line for line in (repository / "README.md").read_text("utf-8").splitlines() if "--to" in line
+    )
+    extensions = FORMATS.keys() - {".yaml"}  # a part of .pgm
+    for text in (command, Export.__doc__ or "", export_map.__doc__ or ""):
+        assert not extensions - set(re.findall(r"\.[a-z]+", text))

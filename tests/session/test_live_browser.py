@@ -356,7 +356,7 @@ def test_three_images_beside_the_map(page: LivePage) -> None:
     shown = "[...document.querySelectorAll('img')].filter(i => i.offsetParent)"  # in the tab that is in front
     sizes = f"() => {shown}.map(i => [i.naturalWidth, i.naturalHeight])"
     page.until(lambda seen: page.page.evaluate(sizes).count([96, 72]) == 3, "three images")
-    page.until(lambda seen: re.search(r"right \d+%", page.text()), "their score")
+    page.until(lambda seen: re.search(r"\d+% right", page.text()), "their score")
     text = page.text()
     for label in labels:
         assert label in text

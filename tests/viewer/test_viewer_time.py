@@ -73,8 +73,12 @@ def test_at_an_earlier_time_the_voxels_of_then_are_drawn_and_not_the_surface_of_
         page.take(DONE)
         assert (drawn.value, drawn.options, colors.value) == ("voxels", ("voxels",), then)
         assert "this is an earlier time" in drawn.hint
+        assert "showing the map as of 2.5 s" in page.page.panel._activity.content
+        page.take(replace(DONE, share=0.5, activity="aligning"))
+        assert "aligning" in page.page.panel._activity.content
         page.span(9.0)
         page.take(DONE)
+        assert "as of" not in page.page.panel._activity.content
         assert (drawn.value, colors.value) == ("surface", chosen)
     page.server.stop()
 

@@ -183,16 +183,18 @@ class Panel(BasePanel):
 
     def show_status(self, status: m.Status) -> None:
         """Show progress and figures."""
-        h, activity = self._hello, status.activity
+        h, activity, past_s = self._hello, status.activity, self.time.past_s
         moving = not (status.paused or status.finished)
         if h.has_surface:
-            past = "it is made of the map of now, and this is an earlier time" if self.time.is_past else ""
+            past = "" if past_s is None else "it is made of the map of now, and this is an earlier time"
             later = "it is made at the end, or while paused" if moving else ""
             self.show_lack_of_surface(status.no_surface or past or later)
         if status.voxels:
             self.offer_colorings(h, status.layers)
         coming = h.has_frames and not status.finished  # else there is nothing to play
         change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
+        if past_s is not None and status.finished and status.share >= 1.0:
+            activity = f"showing the map as of {past_s:.1f} s"
         if not (status.voxels or self._names):
             ended = h.has_frames and not coming
             activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"

@@ -50,9 +50,10 @@ class TimeStrip:
         self._show_list()
 
     @property
-    def is_past(self) -> bool:
-        """True if the map of an earlier time is shown."""
-        return self._span is not None and self._span.shown_s is not None
+    def past_s(self) -> float | None:
+        """The earlier time that is shown, in seconds on the strip; None for now."""
+        span = self._span
+        return None if span is None or span.shown_s is None else span.shown_s - span.start_s
 
     def chosen_s(self) -> float | None:
         """The stamp of the time on the slider, None at its right end, which is now."""
