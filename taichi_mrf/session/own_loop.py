@@ -13,6 +13,9 @@ from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.config.arguments import ArgumentTypeError, shown
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -82,6 +85,12 @@ class LivePage:
             self._revision = revision
             run.show_activity(_UP_TO_DATE, 1.0)
         return not run.is_over
+
+    @property
+    def selected(self) -> NDArray[np.float64]:
+        """Centres (n, 3) in metres, world, of the voxels that a user has clicked on or framed last, as of the
+        last :meth:`update`; none once the answer is closed. ``m.occupancy(page.selected)`` reads them."""
+        return self._session.state.selected_m
 
     def serve(self) -> None:
         """Answer the page until it ends or Ctrl-C is pressed. Edits are inferred at once, and the page shows

@@ -5,6 +5,8 @@ from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
+import numpy as np
+
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.schedule import InferProgress
@@ -31,7 +33,7 @@ from taichi_mrf.session.session_core import WAIT_SECONDS, Policy, SessionCore
 from taichi_mrf.session.shown_extras import lack_of_surface
 from taichi_mrf.session.shown_map import ShownMap
 from taichi_mrf.session.source import Source, saved_unsettled
-from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Status, TimeSpan
+from taichi_mrf.viewer.messages import Bricks, CurrentCamera, KeyframeInfo, Notice, Select, Status, TimeSpan
 
 RATE_SECONDS = 5.0
 """Seconds over which the rates of keyframes and of frames are averaged."""
@@ -155,7 +157,8 @@ class Run(SessionCore):
 
     ``stepping``: take frames until one more keyframe is added, at any pace. ``current`` is the frame
     that was read last. ``version`` changes with the map that is shown and with the current camera. ``full``
-    is the reason if the last frame did not fit into memory, else None.
+    is the reason if the last frame did not fit into memory, else None. ``selected_m`` are the centres (n, 3)
+    of the voxels that a user has selected.
     """
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
@@ -197,6 +200,7 @@ class Run(SessionCore):
         self.progress = Progress()
         self.current: Frame | None = None
         self.stepping, self.full = False, None
+        self.selected_m = np.zeros((0, 3))
         self.send_everything()
 
     def send_everything(self) -> None:
@@ -225,6 +229,10 @@ class Run(SessionCore):
             self.show_camera(self.current)
         self.mapper.shown.start_over()
         self.publish()
+
+    def select(self, request: Select) -> None:
+        """Note the voxels that a user of the page has selected."""
+        self.selected_m = request.points_m
 
     def look_at_keyframes(self) -> None:
         """Show what another program has done to its map's keyframes since the last call."""

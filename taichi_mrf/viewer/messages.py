@@ -399,6 +399,14 @@ class WhoSays(Request):
 
 
 @dataclass(frozen=True)
+class Select(Request):
+    """Note the voxels that a user has clicked on or framed, by their centres (n, 3) in metres, world; none
+    once the answer is closed."""
+
+    points_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class PixelRay(Request):
     """Show the ray of a keyframe's pixel; ``u`` and ``v`` in pixels, (0, 0) is the centre of the first
     one."""

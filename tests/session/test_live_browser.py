@@ -290,7 +290,7 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     said = float(re.search(r"probability\s+(\S+)", answer).group(1))
     assert abs(said - saved.decided.occupancy([first])[0]) < 0.002
     votes = page.page.get_by_role(
-        "button", name=re.compile(r"^Switch off room-000\d: (occupied|free), \d+%$")
+        "button", name=re.compile(r"^room-000\d: (occupied|free), \d+% · switch off$")
     )
     assert votes.count() >= 1
     other = max(page.free_places(nearest[20:400:20]), key=lambda place: np.hypot(place[0] - x, place[1] - y))
@@ -361,11 +361,11 @@ def test_three_images_beside_the_map(page: LivePage) -> None:
     for label in labels:
         assert label in text
     page.screenshot("images")
-    page.select("View", "chosen keyframe")
+    page.select("Images of", "chosen keyframe")
     name = page_chosen(page)
     page.tab("Images")
     page.until(lambda seen: name in page.text(), "the chosen keyframe's images")
-    page.select("View", "current camera")
+    page.select("Images of", "current camera")
     page.tick("Show images", on=False)
 
 

@@ -159,12 +159,12 @@ def test_a_keyframe_is_switched_off_where_it_says_that_a_voxel_is_occupied(
     nearest = sorted(page.places("/voxels/", "points"), key=lambda place: place[2])
     page.click(*page.free_places(nearest[:20])[0][:2])
     page.until(lambda seen: "alone each would say" in page.text(), "what keyframes say")
-    button = page.page.get_by_role("button", name=re.compile("^Switch off ")).first
+    button = page.page.get_by_role("button", name=re.compile(" · switch off$")).first
     name = re.search(r"room-\d+", button.inner_text()).group()
     button.click()
     edited.remove_keyframe(next(id for id, keyframe in edited.keyframes.items() if keyframe.name == name))
     until_count(page, settled_count(edited), f"without {name}")
-    assert page.page.get_by_role("button", name=re.compile(f"^Switch off {name}")).count() == 0
+    assert page.page.get_by_role("button", name=re.compile(f"^{name}: .* · switch off$")).count() == 0
     page.press("Undo")
     until_same(page, before, "the same map with it again")
     page.press("Close")

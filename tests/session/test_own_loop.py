@@ -21,7 +21,7 @@ import taichi_mrf as tm
 from taichi_mrf.config.arguments import ArgumentTypeError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.session.own_loop import LivePage
-from taichi_mrf.viewer.messages import Notice, Quit, Request, Status, Switch, Update
+from taichi_mrf.viewer.messages import Notice, Quit, Request, Select, Status, Switch, Update
 
 
 def page_of(m: MRFMap) -> tuple[LivePage, FakeLink]:
@@ -83,6 +83,11 @@ def test_the_page_edits_the_map_of_the_loop() -> None:
     page.update()
     assert {each.name for each in m.keyframes.values()} == set(names(link))
     assert link.of_type(Status)[-1].activity == "the map as of the last update"
+    assert page.selected.shape == (0, 3)
+    there_m = np.array([[0.5, 0.5, 0.5]])
+    link.ask(Select(there_m))
+    page.update()
+    np.testing.assert_array_equal(page.selected, there_m)
     link.ask(Quit())
     assert not page.update()
     assert not page.update()

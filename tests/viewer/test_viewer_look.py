@@ -305,6 +305,7 @@ def test_the_curves_are_steps_over_the_voxels() -> None:
     # The band is the measurement less its bias, and one sigma to either side.
     np.testing.assert_allclose([x[band > 0].min(), x[band > 0].max()], [1.8, 1.9], atol=1e-5)
     np.testing.assert_allclose(x[measured > 0], 1.95, atol=2e-6)
+    assert np.ptp(x[np.flatnonzero(measured)[[0, -1]] + [-1, 1]]) < 1e-4  # a line, no triangle
     assert not curves(answer(None))[1].any()
 
 

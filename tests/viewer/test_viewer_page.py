@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,9 +18,9 @@ from raw_viewer_client import RawClient, camera_message, raw_client, widget_mess
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.live.answer import SWITCHES
+from taichi_mrf.viewer.live.answer import SWITCHES, beside
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Dragged
+from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Clicked, Dragged
 from taichi_mrf.viewer.scene.base_panel import Joined, Used
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
@@ -183,8 +184,10 @@ def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: LivePage) -> 
 def test_controls_of_a_replay_are_there_while_frames_are_to_come(handled: LivePage) -> None:
     panel, status = handled.page.panel, replace(DONE, finished=False)
     for done in (False, True, False):
-        handled.take(replace(status, finished=done))
-        assert list(panel._run.options) == (["Reset"] if done else ["Play", "Pause", "Step", "Reset"])
+        for paused in (True, False):
+            handled.take(replace(status, finished=done, paused=paused))
+            first = "Play" if paused else "Pause"
+            assert list(panel._run.options) == (["Reset"] if done else [first, "Step", "Reset"])
     handled.take(replace(HELLO, has_frames=False), DONE)
     assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
@@ -200,16 +203,34 @@ def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: LivePage) -> No
 
 def test_an_empty_map_says_what_it_waits_for(handled: LivePage) -> None:
     handled.take(HELLO)  # without the keyframes
+
+    def waiting() -> Any:
+        return handled.server.scene.get_handle_by_name("/waiting")
+
     for finished, said in ((False, "waits; it is empty until the first"), (True, "waits; no frame became")):
         handled.take(replace(DONE, activity="waits", voxels=0, finished=finished))
         assert said in handled.page.panel._activity.content
+        assert waiting() is not None
     handled.take(keyframe(0), replace(DONE, activity="waits"))
     assert ">waits<" in handled.page.panel._activity.content
+    assert waiting() is None
 
 
-def test_the_size_of_the_file_is_said_before_it_is_written(handled: LivePage) -> None:
-    handled.take(replace(DONE, memory_mb=1234.4))
-    assert "at most about 1,234 MB" in handled.page.panel._size.content
+def test_the_sizes_of_files_are_said_before_they_are_written(handled: LivePage) -> None:
+    panel = handled.page.panel
+    handled.take(replace(keyframe(0), rays=20_000_000), replace(DONE, voxels=1_000_000))
+    panel.show_counts({"map": 9, "voxels": 50_000}, None, False)
+    assert panel._size.content == "About: Map 13 MB, Voxels 1.3 MB."
+    handled.take(replace(DONE, voxels=1_000_000, layers=(COLORS,)))
+    panel.show_counts({"map": 0, "voxels": 50_000, "triangles": 100_000}, None, False)
+    assert panel._size.content == "About: Map 21 MB, Voxels 1.3 MB, Mesh 2.9 MB."
+
+
+def test_the_button_of_a_recording_says_what_it_does_next(handled: LivePage) -> None:
+    button = handled.page.panel._save["Recording (.viser)"]
+    for press in ("Stop and save: Recording (.viser)", "Recording (.viser)"):
+        handled.act("Recording (.viser)")
+        assert button.label == press
 
 
 def test_the_page_says_how_sure_free_space_is(handled: LivePage) -> None:
@@ -419,6 +440,48 @@ def test_no_client_can_name_a_recording_that_is_not_offered(handled: LivePage, b
     used = [item for item in inbox.wait(0.0) if isinstance(item, Used)]
     assert [each.action for each in used] == ["Recording"]
     assert recording.options == ("a", "b/map.npz")
+
+
+def places(width: int, height: int, x: float, y: float) -> tuple[float, float]:
+    camera: Any = SimpleNamespace(image_width=width, image_height=height)
+    return beside(camera, (x / width, y / height))
+
+
+@pytest.mark.parametrize("width", [1280, 1920])
+def test_the_answer_covers_neither_the_click_nor_the_middle_nor_the_panel(width: int) -> None:
+    free = 0.73 * width
+    for x in np.arange(10.0, free, 25.0):
+        left, top = places(width, 720, x, 360.0)
+        right = left + 290
+        assert left >= 0
+        assert right <= free
+        assert not left < x < right
+        assert not left < free / 2 < right
+        assert 0 <= top <= 290
+
+
+def test_what_is_selected_is_told_to_the_map_until_the_answer_is_closed(handled: LivePage) -> None:
+    handled.server.scene.reset()
+    log_odds = np.full((1, 512), -900, np.int16)
+    log_odds[0, 0] = 900  # the voxel at the origin
+    none = np.zeros((0, 3), np.int32)
+    handled.take(m.Bricks("map", np.zeros((1, 3), np.int32), log_odds, np.ones((1, 512), np.uint8), none))
+    handled.page.options = replace(handled.page.options, draw_as="voxels", keyframes=False)
+    handled.page.map.look_changed()
+    handled.page._flush()
+    handled.take(Clicked((0.05, 0.05, -3.0), (0.0, 0.0, 1.0), (0.0, 0.0)))
+    selected = [each.points_m for each in handled.asked if isinstance(each, m.Select)]
+    np.testing.assert_allclose(selected, [[[0.05, 0.05, 0.05]]])
+    assert "as of" not in handled.page.answer._text.content
+    handled.take(m.TimeSpan(0.0, 0.0, 9.0, 2.5))
+    handled.page._show_votes(m.Votes(handled.page.answer.point, ((0, 2.0),)))
+    assert "2.5 s; what keyframes say is of now" in handled.page.answer._text.content
+    assert "one keyframe sees this; it says:" in handled.page.answer._text.content
+    assert handled.page.answer._switches[0].label == "frame 0: occupied, 88% · switch off"
+    handled.page.panel.show_images(m.Images("frame 0", *[np.zeros((2, 2, 3), np.uint8)] * 3, "97% right"))
+    assert "of the map as it is now" in handled.page.panel._score.content
+    handled.act("Close")
+    assert len(handled.asked[-1].points_m) == 0
 
 
 def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel, rows_html
 from taichi_mrf.viewer.scene.keyframe_layer import draw_lines
+from taichi_mrf.viewer.scene.viewpoint import PANEL_OF_WINDOW
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 
 Point = tuple[float, float, float]
@@ -58,8 +59,9 @@ class VoxelAnswer:
         self._scene.add_label("/answer", label, position=np.array(self.point))
         text = "asking the keyframes …" if known is None else "this map does not know which keyframes see it"
         if known:
-            seen_by = f"{len(votes)} keyframes see this" if len(votes) > 1 else "one keyframe sees this"
-            text = f"{seen_by}; alone each would say:" if votes else "no keyframe that is on sees this"
+            several = f"{len(votes)} keyframes see this; alone each would say:"
+            text = several if votes else "no keyframe that is on sees this"
+            text = "one keyframe sees this; it says:" if len(votes) == 1 else text
         self._text.content = (
             f'{rows_html(facts | self._apart)}<p style="margin:0.3em 1.25em;font-size:0.85em">{text}</p>'
         )
@@ -67,7 +69,7 @@ class VoxelAnswer:
         for i, button in enumerate(self._switches):
             button.visible = i < len(self.said_by)
             if button.visible:
-                button.label = f"Switch off {votes[i][0].name}: {in_words(votes[i][1])}"
+                button.label = f"{votes[i][0].name}: {in_words(votes[i][1])} · switch off"
 
     def clear(self) -> None:
         """Hide the answer, and remove the line from the scene."""
@@ -77,12 +79,16 @@ class VoxelAnswer:
 
 
 def beside(camera: viser.CameraHandle, share: ArrayLike) -> tuple[float, float]:
-    """The panel's upper left corner, in pixels: beside a place (2,), in shares of a browser's window, towards
-    its middle, as far as it fits in."""
+    """The panel's upper left corner, in pixels: beside a place (2,), in shares of a browser's window, or else
+    at the edge, where it covers neither the place nor the middle of the map nor the page's own panel."""
     width, height = camera.image_width, camera.image_height
     x, y = (np.asarray(share) * (width, height)).tolist()
-    left = x + _ASIDE_PX if x < 0.45 * width else x - _ASIDE_PX - _WIDTH_PX
-    return max(left, 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
+    most = width * (1 - PANEL_OF_WINDOW) - _WIDTH_PX
+    beside = (x - _ASIDE_PX - _WIDTH_PX, x + _ASIDE_PX, 0.0, most)
+    fits = [left for left in beside if 0 <= left <= most and not left < x < left + _WIDTH_PX]
+    middle = 0.5 * width * (1 - PANEL_OF_WINDOW)
+    free = [left for left in fits if not left < middle < left + _WIDTH_PX]
+    return next(iter([*free, *fits]), 0.0), max(min(y, height - _HEIGHT_PX), 0.0)
 
 
 def in_words(log_odds: float) -> str:
@@ -91,11 +97,11 @@ def in_words(log_odds: float) -> str:
     return f"{'occupied' if log_odds > 0 else 'free'}, {100 * sure:.0f}%"
 
 
-def facts_of_many(points: NDArray[np.float64]) -> dict[str, str]:
-    """Number, middle and size of some voxels with centres (n, 3) in metres."""
+def facts_of_many(voxels: int, points: NDArray[np.float64]) -> dict[str, str]:
+    """Number of some voxels, and middle and size of what is shown of them: points (n, 3) in metres."""
     low, high = points.min(axis=0), points.max(axis=0)
     return {
-        "voxels": f"{len(points):,}",
+        "voxels": f"{voxels:,}",
         "middle x, y, z (m)": ", ".join(f"{value:.2f}" for value in (low + high) / 2),
         "size x, y, z (m)": " x ".join(f"{value:.2f}" for value in high - low),
     }

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import viser
 import viser.transforms as vtf
+from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
@@ -16,6 +17,7 @@ from taichi_mrf.viewer.live.panel import (
     CHOSEN_KEYFRAME,
     DECLINE,
     POSITION_STEP_M,
+    RECORD,
     SPEEDS,
     Clicked,
     Dragged,
@@ -50,6 +52,7 @@ class Page(BasePage[Panel]):
         self._question: m.RayThrough | m.WhoSays  # what the answer beside the click is about
         self._facts: Callable[[], dict[str, str]]  # what the page itself knows of it
         self.answer = VoxelAnswer(server.scene, self.panel)
+        self._waits = False  # whether the scene says that the map is empty
         self._in_photo = False  # whether the page has opened in the colours of photographs
         self.handlers |= {
             m.Hello: self._begin,
@@ -93,7 +96,7 @@ class Page(BasePage[Panel]):
             "Position (m)": lambda client: self._edit(self._move_as_typed),
             "Show the ray": lambda client: self._edit(lambda k: m.PixelRay(k.id, *self.panel.pixel.value)),
             "Show images": lambda client: self._watch_images(),
-            "View": lambda client: self._watch_images(),
+            "Images of": lambda client: self._watch_images(),
             "Time (s)": self._scrub,
             PLAY_TIME: lambda client: ask(m.ShowTime(self.panel.time.played_s(), play=True)),
             "Map (.npz)": lambda client: ask(m.Save("map", client)),
@@ -102,7 +105,7 @@ class Page(BasePage[Panel]):
             "Picture (.png)": self.downloads.picture,
             LINK: self._tell_of_link,
             "Page (.html)": self.downloads.page,
-            "Recording (.viser)": self._record,
+            RECORD: self._record,
             "Close": lambda client: self._close_answer(),
             **{name: partial(self._switch_off, i) for i, name in enumerate(SWITCHES)},
         }
@@ -148,6 +151,7 @@ class Page(BasePage[Panel]):
 
     def _take_status(self, status: m.Status) -> None:
         self.panel.show_status(status)
+        self._show_waiting(status)
         self.panel.show_history(status.can_undo, status.can_redo)
         growing = not (status.paused or status.finished)
         if self.map is not None and growing != self.map.growing:
@@ -158,6 +162,17 @@ class Page(BasePage[Panel]):
                 self.viewpoint.look_at_everything()
             if self._extras(self.options) != before:
                 self._ask_for_extras()
+
+    def _show_waiting(self, status: m.Status) -> None:
+        """Say in the scene what an empty map waits for."""
+        empty = not (status.voxels or self.keyframes.keyframes)
+        if empty != self._waits:
+            self._waits = empty
+            self.server.scene.remove_by_name("/waiting")
+            if empty:
+                ended = self._hello.has_frames and status.finished
+                text = "no frame became a keyframe" if ended else "waiting for the first keyframe"
+                self.server.scene.add_label("/waiting", text)
 
     def _take_surface_view(self, view: m.SurfaceView) -> None:
         """Show the surface as the picture of a run does: the first time also in its colours."""
@@ -379,7 +394,9 @@ class Page(BasePage[Panel]):
             point_m = self.map.voxel_near(voxel[0])
             x, y, z = point_m.tolist()
             self._facts = partial(facts_of, point_m, self.map.store, self._hello)
-            self._answer(m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), click.place)
+            self._answer(
+                m.RayThrough((x, y, z), click.origin, self.keyframes.chosen), point_m[None], click.place
+            )
 
     def _framed(self, drawn: Framed) -> None:
         """Say how large what is seen in a rectangle is, and ask which keyframes say that it is there."""
@@ -387,31 +404,39 @@ class Page(BasePage[Panel]):
         if handle is None or self.map is None:
             return
         seen = framed(handle.camera, drawn.corners, self.map.points(), self._hello.voxel_size)
-        if len(seen):
-            middle = seen[np.argsort(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))]
-            asked = middle[:: -(-len(seen) // MOST_ASKED)]
-            self._facts = partial(facts_of_many, seen)
-            self._answer(
-                m.WhoSays(tuple((x, y, z) for x, y, z in asked.tolist())),
-                beside(handle.camera, drawn.corners.max(axis=0)),
-            )
+        voxels = self.map.voxels_at(seen)
+        if len(voxels):
+            middle = voxels[np.argsort(np.linalg.norm(voxels - np.median(voxels, axis=0), axis=1))]
+            asked = middle[:: -(-len(voxels) // MOST_ASKED)]
+            self._facts = partial(facts_of_many, len(voxels), seen)
+            question = m.WhoSays(tuple((x, y, z) for x, y, z in asked.tolist()))
+            self._answer(question, voxels, beside(handle.camera, drawn.corners.max(axis=0)))
 
-    def _answer(self, question: m.RayThrough | m.WhoSays, place: tuple[float, float]) -> None:
-        """Open the answer to a question at a ``place`` in the window, and ask it."""
+    def _answer(
+        self, question: m.RayThrough | m.WhoSays, voxels: NDArray[np.float64], place: tuple[float, float]
+    ) -> None:
+        """Open the answer to a question about ``voxels`` (n, 3) at a ``place`` in the window, and ask it."""
         self._question = question
+        self.ask(m.Select(voxels))
         self.answer.move(question.point if isinstance(question, m.RayThrough) else question.points[0], place)
-        self.answer.show(self._facts())
+        self.answer.show(self._facts() | self._when())
         self.ask(question)
 
     def _show_votes(self, answer: m.Votes) -> None:
         if self.map is not None and answer.point == self.answer.point:
             known = self.keyframes.keyframes
             votes = [(known[id], log_odds) for id, log_odds in answer.votes if id in known]
-            self.answer.show(self._facts(), votes, answer.known)
+            self.answer.show(self._facts() | self._when(), votes, answer.known)
+
+    def _when(self) -> dict[str, str]:
+        """The time that facts are of, if it is an earlier one; what keyframes say is of now."""
+        past_s = self.panel.time.past_s
+        return {} if past_s is None else {"as of": f"{past_s:.1f} s; what keyframes say is of now"}
 
     def _close_answer(self) -> None:
         """Close the answer, and take its ray out of the scene; the plot stays."""
         self.answer.clear()
+        self.ask(m.Select(np.zeros((0, 3))))
         self.server.scene.remove_by_name("/ray")
 
     def _switch_off(self, place: int, client: int) -> None:

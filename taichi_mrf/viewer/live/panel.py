@@ -1,6 +1,6 @@
 """The widgets of the live page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -17,6 +17,7 @@ from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.view_options import Draw, ViewOptions
 from taichi_mrf.viewer.scene.widgets import change, in_html, in_markdown
 from taichi_mrf.viewer.transport.pulse import LINK
+from taichi_mrf.voxels.layers import COLORS
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Dragged(Event):
     holding: bool
 
 
-RUN_BUTTONS = ("Play", "Pause", "Step", "Reset")
+RUN_BUTTONS = ("Pause", "Play", "Step", "Reset")
+"""Of the first two only one is offered, and of all but the last none once no frames are left."""
 HISTORY_BUTTONS = ("Undo", "Redo")
 COMMANDS = {
     "Return to the opening view": ("Home", "H", None),
@@ -58,6 +60,7 @@ COMMANDS = {
 }
 """Entries of the command palette: action, key, and the key that is held with it."""
 EDIT_BUTTONS = ("On/off", "Freeze", "Move", "Put back")
+RECORD = "Recording (.viser)"
 SAVE_BUTTONS = {
     "Map (.npz)": "The map with its keyframes, for `taichi-mrf live` and `MRFMap.load`.",
     "Voxels (.ply)": "The voxels with probability 0.5 or more, for MeshLab, CloudCompare or Blender.",
@@ -65,8 +68,13 @@ SAVE_BUTTONS = {
     "Picture (.png)": "What this browser shows.",
     LINK: "Put what this browser looks at into the page's address, and copy that.",
     "Page (.html)": "The scene in one file that any browser opens, without a server.",
-    "Recording (.viser)": "Start recording the scene; press again to get the file.",
+    RECORD: "Start recording the scene; press again to get the file.",
 }
+RAY_BYTES, COLORED_BYTES, VOXEL_BYTES = 0.6, 1.0, 1.3
+"""Bytes that a measured pixel, without and with its colour, and a voxel of the map take in a map's file, as
+measured on four recordings, of which none is a third off."""
+POINT_BYTES, TRIANGLE_BYTES = 26, 29
+"""Bytes of a voxel in voxels.ply, and of a triangle with its share of vertices in mesh.ply."""
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
 AGREE, DECLINE = "agree", "decline"
 """Actions of the answers to a question."""
@@ -83,6 +91,7 @@ class Panel(BasePanel):
         self._names: dict[str, int] = {}
         self._no_surface, self._chosen = "", (ViewOptions().draw_as, ViewOptions().color_by)
         self._all = (0.0, 0.0)
+        self._rays, self._voxels, self._colored = 0, 0, False
         self._thumbnail_of: NDArray[np.uint8] | None = None
         self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         hint = "Map another recording of this folder; unsaved changes are asked about first."
@@ -95,8 +104,7 @@ class Panel(BasePanel):
         self.add_buttons(
             "View",
             ("Home", "Top", "Front", "Side", "Fit"),
-            "Keys H, 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys. Click into the map, or drag "
-            "with Shift held, to see which keyframes say what is there, and how large it is.",
+            "Keys H, 1, 2, 3 and 0; F follows the camera, Ctrl-K lists all keys.",
         )
         self.view_options.add("follow")
         for label, command in COMMANDS.items():
@@ -117,8 +125,7 @@ class Panel(BasePanel):
         with tabs.add_tab("Save"):
             self.unsaved = gui.add_markdown("The map has changes that are not saved.", visible=False)
             self._size = gui.add_markdown("")
-            for name, hint in SAVE_BUTTONS.items():
-                self.add_button(name, hint)
+            self._save = {name: self.add_button(name, hint, name) for name, hint in SAVE_BUTTONS.items()}
         with tabs.add_tab("About"):
             self._numbers = gui.add_html("")
             self.add_notices()
@@ -187,12 +194,13 @@ class Panel(BasePanel):
         moving = not (status.paused or status.finished)
         if h.has_surface:
             past = "" if past_s is None else "it is made of the map of now, and this is an earlier time"
-            later = "it is made at the end, or while paused" if moving else ""
+            later = "it is made at the end, or while paused" if moving or not status.voxels else ""
             self.show_lack_of_surface(status.no_surface or past or later)
         if status.voxels:
             self.offer_colorings(h, status.layers)
         coming = h.has_frames and not status.finished  # else there is nothing to play
-        change(self._run, options=RUN_BUTTONS if coming else RUN_BUTTONS[-1:])
+        run = (RUN_BUTTONS[status.paused], *RUN_BUTTONS[2:]) if coming else RUN_BUTTONS[-1:]
+        change(self._run, options=run)
         if past_s is not None and status.finished and status.share >= 1.0:
             activity = f"showing the map as of {past_s:.1f} s"
         if not (status.voxels or self._names):
@@ -200,7 +208,7 @@ class Panel(BasePanel):
             activity += "; no frame became a keyframe" if ended else "; it is empty until the first keyframe"
         self.show_activity(activity, status.share, moving)
         self._show_speed(status.speed)
-        self._size.content = f"The map's file takes at most about {max(status.memory_mb, 1):,.0f} MB."
+        self._voxels, self._colored = status.voxels, COLORS in status.layers
         self._numbers.content = rows_html(
             {
                 "source": h.source,
@@ -219,6 +227,18 @@ class Panel(BasePanel):
             }
         )
 
+    def show_counts(self, counts: Mapping[str, int], square_m: float | None, recording: bool) -> None:
+        """Also show about how large the files are, and whether the next press ends a recording."""
+        super().show_counts(counts, square_m, recording)
+        sizes = {
+            "Map": self._voxels * VOXEL_BYTES + self._rays * (COLORED_BYTES if self._colored else RAY_BYTES),
+            "Voxels": counts.get("voxels", 0) * POINT_BYTES,
+            "Mesh": counts.get("triangles", 0) * TRIANGLE_BYTES,
+        }
+        said = ", ".join(f"{name} {max(size / 1e6, 0.1):.2g} MB" for name, size in sizes.items() if size)
+        self._size.content = f"About: {said}." if said else ""
+        change(self._save[RECORD], label=f"Stop and save: {RECORD}" if recording else RECORD)
+
     def _show_speed(self, factor: float | None) -> None:
         """Set the dropdown to the speed in force, also one that only the command line offers."""
         change(self.speed, visible=factor is not None)
@@ -230,6 +250,7 @@ class Panel(BasePanel):
         """List the keyframes and show the chosen one. A frozen keyframe cannot be changed, so its widgets
         are disabled or hidden."""
         listed = [keyframes[id] for id in sorted(keyframes)]
+        self._rays = sum(each.rays for each in listed)
         self._names = {
             f"{each.id}: {each.name} ({'earlier, ' * each.earlier}{each.state})": each.id for each in listed
         }
@@ -242,6 +263,7 @@ class Panel(BasePanel):
         fixed = chosen is None or keyframes[chosen].state == "frozen"
         for widget in (self.position, self.pixel, self._pixel_button):
             change(widget, disabled=fixed)
+        change(self.pixel, label="Pixel (u, v)" if chosen is None else f"Pixel of {keyframes[chosen].name}")
         change(self._edits, visible=not fixed)  # viser cannot disable a row of buttons
         change(self._thumbnail, visible=chosen is not None)
         if chosen is None:
@@ -265,7 +287,8 @@ class Panel(BasePanel):
                 picture.image = getattr(images, name)
             picture.visible = images is not None
         title, score = ("", "") if images is None else (images.title, images.score)
-        self._score.content = f"**{in_markdown(title)}**\n\n{in_markdown(score)}" if title else ""
+        now = "" if self.time.past_s is None else "\n\nof the map as it is now"
+        self._score.content = f"**{in_markdown(title)}**\n\n{in_markdown(score)}{now}" if title else ""
 
     def ask(
         self, client: viser.ClientHandle, then: Callable[[], None], title: str, text: str, yes: str, no: str
@@ -325,7 +348,7 @@ class Panel(BasePanel):
         gui = self.gui
         box = gui.add_checkbox("Show images", False, hint="Keep them up to date while mapping.")
         self.images = self.watch(box)
-        self.view = self.watch(gui.add_dropdown("View", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
+        self.view = self.watch(gui.add_dropdown("Images of", [CURRENT_CAMERA, CHOSEN_KEYFRAME]))
         self._score = gui.add_markdown("")
         labels = {
             "measured": "measured depth",

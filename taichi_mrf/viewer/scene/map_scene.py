@@ -23,7 +23,7 @@ from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import Look, VoxelLayer, cut_picture, look_of, show_cut
 from taichi_mrf.viewer.scene.voxel_store import Cut, VoxelStore
 from taichi_mrf.viewer.scene.widgets import change
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.layout import BRICK, grid_keys
 
 UPDATES_PER_SECOND = 8
 REST_S = 0.5
@@ -117,9 +117,10 @@ class MapScene:
         return every.min(axis=0), every.max(axis=0)
 
     def counts(self) -> dict[str, int]:
-        """How many of what is shown, or will be once everything has been sent, by name."""
+        """How many of what is shown, or will be once everything has been sent, by name; ``voxels`` of the map
+        also while its surface is shown in their place."""
         counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
-        counts |= {"dynamic": self.layers["map"].dynamic_shown}
+        counts |= {"voxels": counts["map"], "dynamic": self.layers["map"].dynamic_shown}
         if self.shows_surface or not self._options.map:
             counts |= {"map": 0, "dynamic": 0}
         if self.shows_surface:
@@ -141,6 +142,12 @@ class MapScene:
         centres = self.layers["map"].points()
         apart_m = np.linalg.norm(centres - point_m, axis=1)
         return centres[np.argmin(apart_m)] if (apart_m < 1.5 * self.hello.voxel_size).any() else point_m
+
+    def voxels_at(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The centres (m, 3) of the shown voxels that some points (n, 3) lie in, metres, world."""
+        centres = self.layers["map"].points()
+        held, given = (np.floor(each / self.hello.voxel_size) for each in (centres, points_m))
+        return centres[np.isin(grid_keys(held.astype(np.int64)), grid_keys(given.astype(np.int64)))]
 
     def seen_points(self) -> NDArray[np.float64]:
         """Points (n, 3) of all that is seen of both maps, in metres, world."""

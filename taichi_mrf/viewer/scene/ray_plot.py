@@ -56,7 +56,10 @@ class RayPlot:
     def clear(self) -> None:
         """Hide the plot and the ray."""
         self._plot.visible = False
-        self._text.content = "Click a voxel or the picture of a keyframe, or type a pixel of the chosen one."
+        self._text.content = (
+            "Click a voxel or the picture of a keyframe, or type a pixel of the chosen one. Drag with Shift "
+            "held to ask about all voxels in a rectangle."
+        )
         self._scene.remove_by_name("/ray")
 
 
@@ -70,7 +73,8 @@ def curves(answer: RayAnswer) -> Curves:
     edges = np.concatenate([begins, ends, [] if band is None else [*band, answer.measured_m or 0.0]])
     last = _end_m(answer)
     first = max(0.0, _surface_m(answer) - _BEFORE_M)
-    x = np.unique(np.concatenate([[first, last], edges - _STEP_M, edges + _STEP_M]))
+    beside = [answer.measured_m + side * _STEP_M for side in (-3, 3)] if answer.measured_m else []
+    x = np.unique(np.concatenate([[first, last], edges - _STEP_M, edges + _STEP_M, beside]))
     x = x[(x >= first) & (x <= last)]
     voxel = np.searchsorted(begins, x, side="right") - 1
     inside = (voxel >= 0) & (x < ends[voxel] if len(ends) else np.zeros(len(x), bool))

@@ -24,7 +24,7 @@ window's width: the panel covers the right side."""
 _ASPECT = 1.6
 """Width over height of a usual window."""
 
-_PANEL_OF_WINDOW, _MARGIN = 0.27, 1.08
+PANEL_OF_WINDOW, _MARGIN = 0.27, 1.08
 """Share of a usual window's width that the panel covers; and the eye's distance over the least one."""
 
 _STRAY = 0.01
@@ -66,7 +66,7 @@ class _View:
             return self
         along = self.target_m - self.eye_m
         if aspect <= 1:
-            back = max(1.0, _ASPECT * (1 - _PANEL_OF_WINDOW) / aspect)
+            back = max(1.0, _ASPECT * (1 - PANEL_OF_WINDOW) / aspect)
             return replace(self, eye_m=self.target_m - back * along)
         half_m = aspect * np.tan(0.5 * self.fov_rad) * np.linalg.norm(along)
         aside = _ASIDE * half_m * _unit(np.cross(along, self.up))
@@ -140,7 +140,7 @@ class ViewpointController:
         fov_rad = _LONG_RAD if side in sides else camera.fov
         right = _unit(np.cross(up, towards))
         axes = np.stack([right, np.cross(towards, right), towards])
-        covered = _PANEL_OF_WINDOW if camera.aspect > 1 else 0.0
+        covered = PANEL_OF_WINDOW if camera.aspect > 1 else 0.0
         eye = fitting_eye(points @ axes.T, camera.aspect, fov_rad, covered)
         target = np.array([*eye[:2], float(np.median(points @ towards))])
         distance = max(float(eye[2] - target[2]), _LEAST_M)
