@@ -283,7 +283,10 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     page.click(x, y)
     page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
     answer = (
-        page.until(lambda seen: "alone each would say" in page.text(), "the answer beside it") and page.text()
+        page.until(
+            lambda seen: re.search("alone each would say|it says:", page.text()), "the answer beside it"
+        )
+        and page.text()
     )
     first = place_of(answer)
     assert saved.decided.state([first]) == [OCCUPIED]
@@ -527,7 +530,7 @@ def test_on_a_phone_an_answer_is_read_below_the_middle_and_closed(
             return bool(cell.count())
 
         page.until(answered, "an answer to a click")
-        lines = [cell, page.page.get_by_text("alone each would say"), close]
+        lines = [cell, page.page.get_by_text(re.compile("alone each would say|it says:")), close]
 
         def can_be_read(seen: Seen) -> bool:
             boxes = [line.bounding_box() for line in lines if line.count()]

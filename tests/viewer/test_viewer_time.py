@@ -139,6 +139,7 @@ def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> 
     np.testing.assert_allclose(box.points.reshape(-1, 3).min(axis=0), [0.75, 1.7, 0.05], atol=1e-6)
     np.testing.assert_allclose(box.points.reshape(-1, 3).max(axis=0), [1.25, 2.3, 0.75], atol=1e-6)
     assert "left" in running.page.panel._legend.content
+    assert "appeared" not in running.page.panel._legend.content  # nothing has
     running.page.options = ViewOptions(changes=False)
     running.page.map.look_changed()
     assert red(running) == 0

@@ -263,7 +263,6 @@ class Panel(BasePanel):
         fixed = chosen is None or keyframes[chosen].state == "frozen"
         for widget in (self.position, self.pixel, self._pixel_button):
             change(widget, disabled=fixed)
-        change(self.pixel, label="Pixel (u, v)" if chosen is None else f"Pixel of {keyframes[chosen].name}")
         change(self._edits, visible=not fixed)  # viser cannot disable a row of buttons
         change(self._thumbnail, visible=chosen is not None)
         if chosen is None:

@@ -68,7 +68,7 @@ class BasePage(Generic[P]):
         self.keyframes = KeyframeLayer(server.scene)
         self.viewpoint = ViewpointController(server)
         self.map: MapScene | None = None
-        self._explained: tuple[Scale | None, bool, bool] | None = None  # by the legend
+        self._explained: tuple[Scale | None, bool, frozenset[str]] | None = None  # by the legend
         self._with_baseline = False
         self._cut_for_space = False  # whether the cut was made to show free space
         self.actions: dict[str, Callable[[int], None]] = {

@@ -5,7 +5,7 @@ A colouring is one entry of :data:`COLORINGS`: the page offers it where the map 
 from the numbers that are there, and shows its help. Layers that pixels feed bring theirs (voxels/layers.py).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal
@@ -259,12 +259,12 @@ def legend_html(scale: Scale) -> str:
     )
 
 
-def key_html(space: bool, changes: bool) -> str:
-    """Key to the colours that are not on the scale, for the page: those of free space, and of changes."""
+def key_html(space: bool, changes: Container[str]) -> str:
+    """Key to the colours that are not on the scale, for the page: those of free space, and of changes of some
+    kinds."""
     named: dict[str, tuple[int, ...]] = {**SPACE_COLORS, "unknown (not drawn)": (0, 0, 0, 0)} if space else {}
-    if changes:
-        named |= {"moves": DYNAMIC_COLOR, **CHANGE_COLORS}
-    return _swatches(named)
+    marks = {"moves": DYNAMIC_COLOR, **CHANGE_COLORS}
+    return _swatches(named | {kind: color for kind, color in marks.items() if kind in changes})
 
 
 def _swatches(named: Mapping[str, tuple[int, ...]]) -> str:

@@ -103,9 +103,10 @@ class MapScene:
         return bool(self.layers["baseline"].store.chunks)
 
     @property
-    def shows_changes(self) -> bool:
-        """True if something is marked that moves, appeared or left."""
-        return self._options.changes and bool(self.changes or self.layers["map"].dynamic_shown)
+    def shows_changes(self) -> frozenset[str]:
+        """Kinds of change that are marked: something "moves", has "appeared", or has "left"."""
+        moves = {"moves"} if self.layers["map"].dynamic_shown else set()
+        return frozenset(moves.union(each.verb for each in self.changes) if self._options.changes else ())
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
