@@ -260,7 +260,6 @@ class Table(Dataset, Generic[AnyRow]):
     """Reads the poses with stamps of their own; None if there are only those of rows."""
 
     def own_poses(self) -> StampedPoses | None:
-        """Those of ``track``."""
         return None if self.track is None else self.track()
 
     @abstractmethod
@@ -269,11 +268,9 @@ class Table(Dataset, Generic[AnyRow]):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """The names of the rows."""
         return [row.name for row in self.rows]
 
     def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
         return [row.stamp for row in self.rows]
 
     def pose(self, index: int) -> Pose:

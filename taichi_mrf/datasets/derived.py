@@ -31,56 +31,46 @@ from taichi_mrf.sensor.frame import Frame
 
 @dataclass
 class Derived(Dataset):
-    """As many frames as ``source`` has, with the same names; subclasses define how a frame is read."""
+    """As many frames as ``source`` has, with the same names, and all else as the source has it; subclasses
+    define how a frame is read."""
 
     source: Dataset = field(kw_only=True)
 
     @property
     def endless(self) -> bool:
-        """True if the source is."""
         return self.source.endless
 
     def awaiting(self) -> str:
-        """What the source waits for."""
         return self.source.awaiting()
 
     def arrivals(self) -> Arrivals | None:
-        """The source's."""
         return self.source.arrivals()
 
     @property
     def stated(self) -> StatedSensor:
-        """The source's."""
         return self.source.stated
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
-        """The source's."""
         return self.source.origin_m
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
-        """The source's."""
         return self.source.stamps()
 
     def pose(self, index: int) -> Pose:
-        """The source's."""
         return self.source.pose(index)
 
     def own_poses(self) -> StampedPoses | None:
-        """The source's."""
         return self.source.own_poses()
 
     def misfit(self) -> str | None:
-        """The source's."""
         return self.source.misfit()
 
     def sensor_of(self, index: int) -> str:
-        """The source's."""
         return self.source.sensor_of(index)
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """The source's."""
         return self.source.frame_names
 
 
@@ -125,30 +115,25 @@ def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
 
 @dataclass
 class Chosen(Derived):
-    """Some frames of ``source``: those with the ``indices``."""
+    """Some frames of ``source``, and what it has of these: those with the ``indices``."""
 
     indices: Sequence[int] = field(kw_only=True)
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """Those of the chosen frames."""
         return [self.source.frame_names[index] for index in self.indices]
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
-        """Those of the chosen frames."""
         stamps = self.source.stamps()
         return [float(stamps[index]) for index in self.indices]
 
     def pose(self, index: int) -> Pose:
-        """The source's of that frame."""
         return self.source.pose(self.indices[index])
 
     def sensor_of(self, index: int) -> str:
-        """The source's of that frame."""
         return self.source.sensor_of(self.indices[index])
 
     def read(self, index: int) -> Frame:
-        """The source's frame. Raises what the source raises."""
         return self.source.read(self.indices[index])
 
 
@@ -374,7 +359,6 @@ class Mended(Derived):
         return self.source.origin_m + self.moved_m
 
     def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises what the source raises."""
         if self.timed is None:
             T = pose_of(self.source.pose(index), self.conventions)
         else:
@@ -388,7 +372,6 @@ class Mended(Derived):
         return T
 
     def read(self, index: int) -> Frame:
-        """The source's frame. Raises what the source raises."""
         frame = self.source.read(index)
         depth_m = axial_depth(frame.depth_m, frame.camera, self.conventions)
         T = pose_of(frame.T_world_camera, self.conventions)

@@ -20,7 +20,7 @@ from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.derived import axial_depth
 from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError, said
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, naming, said
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_file, read_text
@@ -63,10 +63,8 @@ def read_joints(path: Path) -> Joints:
     """Positions from a YAML file, ``name: value``, or a CSV table with the columns stamp and a joint each.
     Raises DatasetError, which names the file, and the line of a table."""
     if path.suffix.lower() != ".csv":
-        try:
+        with naming("", ConfigError):
             values = read_yaml(path)
-        except ConfigError as error:
-            raise DatasetError(str(error)) from error
         if not isinstance(values, dict) or not all(isinstance(x, int | float) for x in values.values()):
             raise DatasetError(f"{path}: expected joints as 'name: value', or a .csv of stamp and joints")
         return Joints(tuple(map(str, values)), np.array([list(values.values())], np.float64))

@@ -122,11 +122,9 @@ class SeveralSensors(Table[SensorFrame]):
         return StatedSensor(reach_m=max(sensor.range_m[1] for sensor in self.sensors))
 
     def sensor_of(self, index: int) -> str:
-        """The name of the sensor that took a frame."""
         return self.rows[index].taken_by.name
 
     def load(self, index: int, row: SensorFrame, T_world_camera: Pose) -> Frame:
-        """The frame of its sensor."""
         sensor = row.taken_by
         with naming(sensor.name, FrameError):
             frame = sensor.dataset.read(row.index)
@@ -148,10 +146,8 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
     _refuse(path, options)
     if _opening:
         raise DatasetError(f"{path}: lists several sensors, as {_opening[0]} does: list all of them there")
-    try:
+    with naming("", ConfigError):
         described = from_dict(SensorsFile, read_yaml(path), str(path))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
     if not described.sensors:
         raise DatasetError(f"{path}: lists no sensor")
     names = [entry.name or f"sensor-{number}" for number, entry in enumerate(described.sensors, start=1)]

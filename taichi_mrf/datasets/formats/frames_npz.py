@@ -73,7 +73,6 @@ class FramesNpz(Table[NpzFrame]):
         return note_of_largest([share_of_largest(image) for image in depth[:: max(1, len(depth) // 4)]])
 
     def load(self, index: int, row: NpzFrame, T_world_camera: Pose) -> Frame:
-        """One frame of its file's arrays."""
         (depth, color), part, i = self._images(row.part), row.part, row.number
         values = measured(depth[i]) if depth.dtype.kind == "u" else depth[i]
         depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)

@@ -108,11 +108,11 @@ def read_calibration(path: Path) -> Pose:
     if words is None:
         raise DatasetError(f"{path}: has no line Tr:, the 3 x 4 matrix from the lidar to the camera")
     try:
-        return as_pose(np.array([float(word) for word in words]).reshape(3, 4))
+        matrix = np.array([float(word) for word in words]).reshape(3, 4)
     except ValueError:
         raise DatasetError(f"{path}: Tr must be 12 numbers") from None
-    except KeyframeError as error:
-        raise DatasetError(f"{path}: Tr: {error}") from error
+    with naming(f"{path}: Tr", KeyframeError):
+        return as_pose(matrix)
 
 
 def _scans(folder: Path) -> list[Path]:
@@ -153,7 +153,8 @@ def open_pairs(folder: Path, options: ReadOptions) -> Dataset:
     if options.depth_scale is not None:
         raise DatasetError(f"{folder}: takes no depth_scale: depth comes from stereo pairs")
     left, right = next(pair for pair in FOLDERS if all((folder / side).is_dir() for side in pair))
-    names = sorted(_images(folder / left) | _images(folder / right), key=_number)
+    every = _images(folder / left) | _images(folder / right)
+    names = sorted(every, key=lambda name: (int(Path(name).stem), name))
     if not names:
         raise DatasetError(f"{folder}: no numbered images in {left} or {right}")
     rig = _read_rig(folder, left, names, options)
@@ -184,10 +185,6 @@ def open_pairs(folder: Path, options: ReadOptions) -> Dataset:
 def _images(folder: Path) -> set[str]:
     """Names of the image files that are a number."""
     return {p.name for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in IMAGE_SUFFIXES}
-
-
-def _number(name: str) -> tuple[int, str]:
-    return int(Path(name).stem), name
 
 
 def _needed(path: Path) -> Path:

@@ -378,15 +378,12 @@ class RtabmapRecording(Table[PosedNode]):
         return note_of_largest(shares)
 
     def load(self, index: int, row: PosedNode, T_world_camera: Pose) -> Frame:
-        """Decode a node's images."""
         where = f"{self.database.path}: node {row.node.id}"
         depth, image = self.database.images(row.node.id, self.color)
         depth_m = decode_depth(depth, f"{where}: depth", self.steps_per_metre)
         height, width = depth_m.shape
-        try:
+        with naming("", ConfigError):
             camera = row.camera.of_images(width, height) if self.own_cameras else self.camera
-        except ConfigError as error:
-            raise DatasetError(str(error)) from error
         if depth_m.shape != camera.shape:
             raise DatasetError(
                 f"{where}: depth is {width} x {height}, the camera {camera.width} x {camera.height}"

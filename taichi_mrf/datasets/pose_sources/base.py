@@ -86,7 +86,6 @@ class CallbackPoses:
     problem: str | None = None
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
-        """Poses that the function returns."""
         return self.function(stamp_s)
 
 
@@ -123,7 +122,6 @@ class WatchedFile:
 
     @property
     def name(self) -> str:
-        """The path."""
         return str(self._path)
 
     @property

@@ -215,12 +215,10 @@ class RealSenseCamera(Dataset):
 
     @property
     def endless(self) -> bool:
-        """A camera never ends."""
         return True
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """Names without end."""
         return EndlessNames("realsense-")
 
     def read(self, index: int) -> Frame:

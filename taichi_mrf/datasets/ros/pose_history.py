@@ -132,12 +132,8 @@ def _from_paths(
             T_body_optical = tree.lookup(body, optical, stamp, INTERPOLATION_GAP)
             if T_body_optical is None:
                 continue
-            try:
+            with naming(f"{reader.path}: topic {topic}: the pose at {stamp:.3f} s", KeyframeError):
                 found[stamp] = as_pose(messages.pose_of(each)) @ T_body_optical
-            except KeyframeError as error:
-                raise DatasetError(
-                    f"{reader.path}: topic {topic}: the pose at {stamp:.3f} s: {error}"
-                ) from error
         return found
 
     return PoseHistory(f"{reader.path}: {topic}", [entry.stamp for entry in entries], version)

@@ -287,7 +287,6 @@ class RosReader(TopicSource):
             self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
-        """In the order of recording."""
         previous, ordinal = None, 0
         places = self.places(topic) if self.by_file else []
         for number, (recorded_ns, message, publisher) in enumerate(self._read(topic, None, None)):
@@ -297,15 +296,12 @@ class RosReader(TopicSource):
             yield entry_of(message, recorded_ns, ordinal, publisher, place), message
 
     def places(self, topic: str) -> list[Place]:
-        """The places in the file of a topic's messages, in the order of ``messages``; none if its index is
-        damaged."""
         try:
             return places_of(self._reader.readers, topic, self.topics[topic].type)
         except Exception:  # as on opening
             return []
 
     def read(self, topic: str, entry: Entry) -> Any:
-        """One message again. Raises DatasetError, which names file and topic."""
         found = self._read(topic, entry.recorded_ns, entry.recorded_ns + 1)
         for ordinal, (_, message, _) in enumerate(found):
             if ordinal == entry.ordinal:

@@ -458,11 +458,9 @@ def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ..
             f"says that images have {info.width} x {info.height} pixels, so nothing tells whether its "
             f"intrinsics are theirs; --camera {k} takes them"
         )
-    try:
+    with naming("", ConfigError):
         full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
         camera = StatedCamera(full, _cut(full, info))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
     if rectified or not D.any():
         return camera, ()
     if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:

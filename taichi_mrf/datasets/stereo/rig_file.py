@@ -106,15 +106,13 @@ def open_file(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _read(path: Path) -> RigFile:
-    try:
+    with naming("", ConfigError):
         values = read_yaml(path)
         for known in fields(RigFile):
             needed = known.default is MISSING and known.default_factory is MISSING
             if needed and isinstance(values, dict) and known.name not in values:
                 raise DatasetError(f"{path}: {known.name} is missing in this description of stereo pairs")
         return from_dict(RigFile, values if isinstance(values, dict) else str(values), str(path))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
 
 
 def _images(path: Path, side: str, pattern: str) -> list[Path]:

@@ -392,7 +392,6 @@ class Walked(RenderedSequence):
     camera."""
 
     def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:
-        """A scene in the light of the lamp."""
         x, y, z = T_world_camera[:3, 3].tolist()
         return replace(scene, light=(x, y, z + LAMP_OVER_EYE_M))
 
@@ -420,7 +419,6 @@ class SyntheticCorridor(Walked):
 
     @cached_property
     def scene(self) -> Scene:
-        """The corridor and its rooms, in the world frame."""
         return corridor_scene(self.options.rooms)
 
     @cached_property
@@ -428,7 +426,6 @@ class SyntheticCorridor(Walked):
         return waypoints(self.options.rooms)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         return pose_on_path(self._camera_path, index / max(1, self.options.frames - 1))
 
 
@@ -458,7 +455,6 @@ class SyntheticRing(Walked):
 
     @cached_property
     def scene(self) -> Scene:
-        """The corridor in the world frame."""
         return ring_scene(self.options.length, bare=self.options.walls == "bare")
 
     @cached_property
@@ -467,7 +463,6 @@ class SyntheticRing(Walked):
         return ring_path(self.options.length)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         return self.camera_path.pose_at(self.camera_path.length_m * index / max(1, self.options.frames - 1))
 
 

@@ -245,7 +245,6 @@ class MeshSequence(Table[Row]):
         return self.scene.render_depth(self.camera, self.pose(index))
 
     def load(self, index: int, row: Row, T_world_camera: Pose) -> Frame:
-        """Render one frame, with the noise that the options ask for."""
         depth_m = self.clean_depth(index)
         if self.options.noise != "none":
             sensor = SENSORS[self.options.noise]

@@ -145,7 +145,6 @@ class RenderedSequence(Dataset):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """The names of the frames in order, for reports."""
         place = self.name.partition(":")[2]
         return [f"{place}-{index:04d}" for index in range(self.options.frames)]
 
@@ -155,7 +154,6 @@ class RenderedSequence(Dataset):
         return StatedSensor(reach_m=SensorConfig().max_depth)
 
     def pose(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4). Raises IndexError if there is no such frame."""
         if not 0 <= index < self.options.frames:
             raise IndexError(f"{self.name} has {self.options.frames} frames, there is no frame {index}")
         return self.pose_at(index)
@@ -170,7 +168,6 @@ class RenderedSequence(Dataset):
         return self.scene.signed_distance(points)
 
     def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
         return [self.stamp_at(index) for index in range(self.options.frames)]
 
     def read(self, index: int) -> Frame:

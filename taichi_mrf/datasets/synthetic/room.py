@@ -348,15 +348,12 @@ class SyntheticRoom(RenderedSequence):
         return self.moving_scene.static if self.moving_scene else room_scene()
 
     def scene_at(self, index: int) -> Scene:
-        """All solids at the time of a frame."""
         return self.moving_scene.at(self.stamp_at(index)) if self.moving_scene else self.scene
 
     def stamp_at(self, index: int) -> float:
-        """The time of a frame in seconds."""
         return float(index) if self.moving_scene else super().stamp_at(index)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         if self.moving_scene:
             return self.moving_scene.camera.pose(self.stamp_at(index))
         return camera_pose(index / self.options.frames)

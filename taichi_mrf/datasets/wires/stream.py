@@ -107,16 +107,13 @@ class Robot(Dataset):
 
     @property
     def endless(self) -> bool:
-        """A robot never ends."""
         return True
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """The numbers of messages."""
         return EndlessNames()
 
     def awaiting(self) -> str:
-        """Why there is no frame."""
         self._take(self.heard.hear())
         if self._next is not None:
             return ""
@@ -332,7 +329,6 @@ class LidarRobot(Robot, LidarRecording):
     clouds: Clouds = field(kw_only=True)
 
     def load(self, posed: Posed, stamp: float, name: str) -> Frame:
-        """Decode a cloud."""
         assert posed.pose is not None
         return self.clouds.frame(posed.heard.entry, posed.heard.message, posed.pose, stamp, name)
 
