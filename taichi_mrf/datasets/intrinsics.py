@@ -124,7 +124,8 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
             try:
                 camera = PinholeCamera.from_matrix(*_image_size(default, depth_files), K)
             except ConfigError as error:
-                raise ConfigError(f"line {_line_of_numbers(text)}: {error}") from error
+                first = next(n for n, line in enumerate(text.splitlines(), start=1) if _words(line))
+                raise ConfigError(f"line {first}: {error}") from error
             return of_this_size(camera)
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
@@ -161,11 +162,6 @@ def of_this_size(camera: PinholeCamera) -> PinholeCamera:
 def _words(line: str) -> list[str]:
     """The numbers of a line as text, without comment, brackets and separators."""
     return re.sub(r"[\[\],;]", " ", line.split("#")[0]).split()
-
-
-def _line_of_numbers(text: str) -> int:
-    """The number, from 1, of the first line with numbers."""
-    return next(number for number, line in enumerate(text.splitlines(), start=1) if _words(line))
 
 
 def _camera_from_names(
@@ -275,8 +271,12 @@ def _json_camera(path: Path | str, values: Any) -> PinholeCamera:
 
 
 def _json_values(path: Path) -> Any:
-    text = read_text(path, DatasetError)
+    return json_values(read_text(path, DatasetError), path)
+
+
+def json_values(text: str | bytes, where: str | Path) -> Any:
+    """The content of a JSON file. Raises DatasetError, which begins with ``where``."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not valid JSON: {said(error)}") from error
+        raise DatasetError(f"{where}: not valid JSON: {said(error)}") from error

@@ -3,6 +3,7 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
@@ -217,6 +218,18 @@ def recording(
 def first_file(candidates: Iterable[Path]) -> Path | None:
     """The first of some files that is there."""
     return next((path for path in candidates if path.is_file()), None)
+
+
+def natural(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """A key that orders names by the numbers in them: scan-9 before scan-10."""
+    words = re.split(r"(\d+)", path.stem)
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words], path.name
+
+
+def number_in(name: str) -> int | None:
+    """The last number in a name, None if there is none."""
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else None
 
 
 def beside(folder: Path, name: str) -> Path:

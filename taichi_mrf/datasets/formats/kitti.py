@@ -31,10 +31,11 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import velodyne_sequence
-from taichi_mrf.datasets.lidar.clouds import layout_notes, natural, number_of, read_cloud
+from taichi_mrf.datasets.lidar.clouds import layout_notes, read_cloud
 from taichi_mrf.datasets.lidar.registered import in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.recording import natural, number_in
 from taichi_mrf.datasets.stereo.matching import (
     RecordedPair,
     StereoPairs,
@@ -68,7 +69,7 @@ def open_scans(path: Path, options: ReadOptions) -> Dataset:
     by_number = {int(pose.key): pose for pose in poses.poses}
     found: list[tuple[Path, float, RecordedPose]] = []
     for file in files:
-        number = number_of(file)
+        number = number_in(file.stem)
         if number not in by_number or (stamps is not None and number >= len(stamps)):
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]

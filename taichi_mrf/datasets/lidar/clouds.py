@@ -305,9 +305,7 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
         raise DatasetError(
             f"{path}: is cut short: {header.vertices} vertices take {needed} bytes, it has {held}"
         )
-    vertices = np.frombuffer(data, header.dtype, header.vertices, header.start)
-    with np.errstate(invalid="ignore"):
-        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    return _stacked(np.frombuffer(data, header.dtype, header.vertices, header.start))
 
 
 def _ply_header(path: Path, data: bytes) -> PlyHeader:
@@ -416,10 +414,6 @@ def layout_notes(clouds: Sequence[Path]) -> list[str]:
     return []
 
 
-def _float_points(path: Path) -> NDArray[np.float64]:
-    return _float_table(path)[:, :3].astype(np.float64)
-
-
 def _float_table(path: Path) -> NDArray[np.float32]:
     """x y z, and as many more numbers as each point has (_COLUMNS), as little-endian float32."""
     data = read_bytes(path, DatasetError, "the scan is missing")
@@ -443,28 +437,12 @@ def _spread(table: NDArray[np.float32]) -> float:
     return float(np.log(rows.var(axis=0) + 1e-4).mean()) if len(rows) >= _LEAST_POINTS else 0.0
 
 
-def _pcd_points(path: Path) -> NDArray[np.float64]:
-    return read_pcd(path)[0]
-
-
 READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".npz": _npz_points,
     ".ply": read_ply_points,
-    ".pcd": _pcd_points,
-    ".bin": _float_points,
+    ".pcd": lambda path: read_pcd(path)[0],
+    ".bin": lambda path: _float_table(path)[:, :3].astype(np.float64),
     ".las": read_las,
     ".laz": read_las,
 }
 """Reader of a file, by its ending."""
-
-
-def natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """A key that orders names by the numbers in them: scan-9 before scan-10."""
-    words = re.split(r"(\d+)", path.stem)
-    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words], path.name
-
-
-def number_of(path: Path) -> int | None:
-    """The last number in a file's name, None if there is none."""
-    numbers = re.findall(r"\d+", path.stem)
-    return int(numbers[-1]) if numbers else None

@@ -22,18 +22,11 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.hints import unread_poses
-from taichi_mrf.datasets.lidar.clouds import (
-    READERS,
-    is_cloud,
-    layout_notes,
-    natural,
-    number_of,
-    read_cloud,
-    read_pcd_header,
-)
+from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, layout_notes, read_cloud, read_pcd_header
 from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
+from taichi_mrf.datasets.recording import natural, number_in
 from taichi_mrf.datasets.stereo.matching import read_times
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.datasets.trajectories import TEXTS, in_seconds, is_trajectory, read_trajectory
@@ -122,7 +115,7 @@ def _check_one_map(path: Path, clouds: Sequence[Path], poses: int) -> None:
 
 def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
     """The numbers in the names of scans, by which they find their poses in a file."""
-    numbers = [number for cloud in clouds if (number := number_of(cloud)) is not None]
+    numbers = [number for cloud in clouds if (number := number_in(cloud.stem)) is not None]
     if len(set(numbers)) < len(clouds):
         raise DatasetError(
             f"{path}: its poses go by the numbers of scans, but names such as {clouds[0].name} have no "

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from taichi_mrf.datasets.base import when_called
+from taichi_mrf.datasets.base import reader
 from taichi_mrf.datasets.intrinsics import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
 from taichi_mrf.datasets.ros.names import METADATA, is_bag
@@ -192,27 +192,23 @@ def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], Pose
     return open_file
 
 
-def _graph_poses(path: Path) -> ChangedPoses:
-    return {int(number): T for number, T in read_pose_graph(path, with_edges=False).poses.items()}
-
-
 BAG = PoseKind(
     "ROS bag",
     f"a bag ({', '.join(BAGS)}, or a folder with {METADATA}) with a Path, tf or poses",
     is_bag,
-    when_called("taichi_mrf.datasets.ros.pose_history:open_history"),
+    reader("ros.pose_history:open_history"),
 )
 RTABMAP = PoseKind(
     "RTAB-Map",
     "a database (.db)",
     lambda path: path.suffix == ".db",
-    when_called("taichi_mrf.datasets.formats.rtabmap:open_poses"),
+    reader("formats.rtabmap:open_poses"),
 )
 GRAPH = PoseKind(
     "pose graph",
     f"VERTEX_SE3:QUAT or VERTEX3 lines ({', '.join(SUFFIXES)})",
     is_pose_graph,
-    _watched(_graph_poses),
+    _watched(lambda path: dict(read_pose_graph(path, with_edges=False).poses.items())),
 )
 OPEN3D = PoseKind(
     "Open3D trajectory",
