@@ -71,5 +71,4 @@ def without_black(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
 @lru_cache(maxsize=8)
 def _turned_rays(depth_camera: PinholeCamera, to: ColorCamera) -> NDArray[np.float32]:
     """The depth camera's rays in the colour camera's axes, (3, H, W)."""
-    turned: NDArray[np.float64] = np.einsum("ij,hwj->ihw", to.T_color_depth[:3, :3], depth_camera.rays())
-    return turned.astype(np.float32)
+    return np.einsum("ij,hwj->ihw", to.T_color_depth[:3, :3], depth_camera.rays()).astype(np.float32)

@@ -11,6 +11,7 @@ This is done on frames, so that it is the same for all formats.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -415,10 +416,8 @@ def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | Non
 def _first_pose(dataset: Dataset, conventions: Conventions) -> Pose | None:
     """The pose of the first frame that has one."""
     for index in range(len(dataset)):
-        try:
+        with suppress(FrameError):
             return pose_of(dataset.pose(index), conventions)
-        except FrameError:
-            continue
     return None
 
 
@@ -453,9 +452,7 @@ def _of_frames(dataset: Dataset, stamps: NDArray[np.float64]) -> StampedPoses:
     known: list[int] = []
     poses: list[Pose] = []
     for index in range(len(dataset)):
-        try:
+        with suppress(FrameError):
             poses.append(dataset.pose(index))
             known.append(index)
-        except FrameError:
-            continue
     return stamps[known], poses

@@ -12,6 +12,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -263,11 +264,9 @@ def _kind(image: NDArray) -> str:
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read; a broken one is reported with its frame."""
     for path in paths:
-        try:
+        with suppress(DatasetError):
             height, width = _values(path).shape[:2]
             return width, height
-        except DatasetError:
-            continue
     return None
 
 

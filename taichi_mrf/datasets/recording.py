@@ -256,10 +256,7 @@ def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDA
             f"{path}: the colour image has {columns} x {rows} pixels, depth {width} x {height}, which is not "
             "the same view; without --color only depth is read"
         )
-    scaled: NDArray[np.uint8] = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA).astype(
-        np.uint8
-    )
-    return scaled
+    return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 def _evidence(found: Evidence, steps_per_metre: float) -> str:

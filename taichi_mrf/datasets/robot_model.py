@@ -130,8 +130,7 @@ class RobotModel:
         self.note += f"; around the sensor, and left out: {', '.join(around)}" if around else ""
 
     def _T_camera_part(self, node: str) -> Pose:
-        T: Pose = np.array(self._robot.get_transform(node, self._link), np.float64)
-        return T
+        return np.array(self._robot.get_transform(node, self._link), np.float64)
 
     def covered(self, frame: Frame) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """The pixels (H, W) of a frame whose ray meets the grown body, but for those that measure something

@@ -16,8 +16,7 @@ sensors must count from one beginning, at poses in one world. Each frame states 
 """
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -155,8 +154,12 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
         raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
     sensors, rows = [], []
     for entry, name in zip(described.sensors, names, strict=True):
-        with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError), _opens(path):
-            sensor = _open_sensor(path, entry, name, options)
+        _opening.append(path)
+        try:
+            with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError):
+                sensor = _open_sensor(path, entry, name, options)
+        finally:
+            _opening.clear()
         stamps, frame_names = sensor.dataset.stamps(), sensor.dataset.frame_names
         for i in range(0, len(sensor.dataset), entry.every):
             pose = partial(_pose, sensor, i)
@@ -176,15 +179,6 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
 
 _opening: list[Path] = []
 """The file whose sensors are being opened: one that lists another could name itself, or grow without end."""
-
-
-@contextmanager
-def _opens(path: Path) -> Iterator[None]:
-    _opening.append(path)
-    try:
-        yield
-    finally:
-        _opening.clear()
 
 
 def _pose(sensor: RecordedSensor, index: int) -> Pose:

@@ -225,14 +225,12 @@ def interpolate(
 
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths (...) of vectors (..., n)."""
-    length: NDArray[np.float64] = np.sqrt(_dot(vectors, vectors))
-    return length
+    return np.sqrt(_dot(vectors, vectors))
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Scalar products (...) of vectors (..., n)."""
-    products: NDArray[np.float64] = (a[..., None, :] @ b[..., :, None])[..., 0, 0]
-    return products
+    return (a[..., None, :] @ b[..., :, None])[..., 0, 0]
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -248,8 +246,7 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
             [zy - yz, xz - zx, yx - xy, xx + yy + zz],
         ]
     )
-    vectors: NDArray[np.float64] = np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)))[1]
-    return vectors[..., -1]
+    return np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)))[1][..., -1]
 
 
 def read_timed_poses(path: Path) -> TimedPoses:

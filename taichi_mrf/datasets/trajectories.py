@@ -189,6 +189,14 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def floats(words: Iterable[str | bytes | float], where: str) -> list[float]:
+    """The numbers that are words. Raises DatasetError, which begins with ``where``."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise DatasetError(f"{where} contains something that is not a number") from None
+
+
 def _number(word: str) -> float:
     """A number; nanoseconds keep all their digits."""
     return int(word) if word.isascii() and word.isdecimal() else float(word)

@@ -44,7 +44,7 @@ from taichi_mrf.datasets.stereo.matching import (
     read_times,
     size_of_pairs,
 )
-from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, read_trajectory
+from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, floats, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -253,10 +253,7 @@ def _projection(path: Path, name: str, rows: dict[str, list[str]]) -> NDArray[np
     words = rows.get(name)
     if words is None:
         raise DatasetError(f"{path}: {name} is missing")
-    try:
-        numbers = np.array([float(word) for word in words])
-    except ValueError:
-        raise DatasetError(f"{path}: {name} contains something that is not a number") from None
+    numbers = np.array(floats(words, f"{path}: {name}"))
     if len(numbers) != 12 or not np.isfinite(numbers).all():
         raise DatasetError(
             f"{path}: {name} must be 12 finite numbers (a 3 x 4 matrix), it has {len(numbers)}"

@@ -51,7 +51,7 @@ from taichi_mrf.datasets.images import (
     share_of_largest,
 )
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, watched
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -266,10 +266,8 @@ def _plain(blob: bytes) -> NodeCamera:
     numbers = np.frombuffer(blob, "<f4").astype(np.float64)
     count = len(numbers) - _TRANSFORM
     _refuse(stereo=count in (5, 7), several=count > 7)
-    if count not in (4, 6):
-        raise DatasetError("the calibration is damaged")
     size = numbers[4:6] if count == 6 else np.zeros(2)
-    if not (np.isfinite(size).all() and (size >= 0).all() and (size < _MOST).all()):
+    if count not in (4, 6) or not (np.isfinite(size).all() and (size >= 0).all() and (size < _MOST).all()):
         raise DatasetError("the calibration is damaged")
     return _camera(numbers[:4], int(size[0]), int(size[1]), np.zeros(0), numbers[count:])
 
@@ -370,11 +368,9 @@ class RtabmapRecording(Table[PosedNode]):
         """A note of whole numbers that are no measurements; the unit is known."""
         shares = []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
-            try:
+            with contextlib.suppress(DatasetError):  # no PNG, or reported when its frame is read
                 depth, _ = self.database.images(row.node.id, color=False)
                 shares.append(share_of_largest(decode_unchanged(depth, row.pose_source)))
-            except DatasetError:  # of another kind than PNG, or reported when its frame is read
-                continue
         return note_of_largest(shares)
 
     def load(self, index: int, row: PosedNode, T_world_camera: Pose) -> Frame:
@@ -471,7 +467,4 @@ def changing_poses(path: Path) -> ChangedPoses:
     return {each.stamp: each.pose for each in nodes}
 
 
-def open_poses(path: Path, query: str) -> PoseSource:
-    if query:
-        raise DatasetError(f"{path}: takes no options after a question mark; bags do")
-    return WatchedFile(path, changing_poses, beside=("-wal", "-journal"), is_text=False)
+open_poses = watched(changing_poses, beside=("-wal", "-journal"), is_text=False)

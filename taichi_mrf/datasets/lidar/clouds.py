@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.lidar.las_file import read_las
-from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.datasets.trajectories import floats, pose_from_quaternion
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.bounded import MOST_DIGITS
@@ -76,10 +76,7 @@ def text_columns(
         words = line.split()
         if len(words) != columns:
             raise DatasetError(f"{path}: point {row} has {len(words)} values, expected {columns}")
-        try:
-            found[row] = [float(words[column]) for column in wanted]
-        except ValueError:
-            raise DatasetError(f"{path}: point {row} contains something that is not a number") from None
+        found[row] = floats((words[column] for column in wanted), f"{path}: point {row}")
     return found
 
 
@@ -148,7 +145,7 @@ def _pcd_header(path: Path, data: bytes) -> PcdHeader:
     encoding = " ".join(entries["DATA"]).lower()
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise DatasetError(f"{path}: DATA {encoding[:40]!r} is not ascii, binary or binary_compressed")
-    viewpoint = _numbers(path, "VIEWPOINT", entries.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"])
+    viewpoint = floats(entries.get("VIEWPOINT") or [0, 0, 0, 1, 0, 0, 0], f"{path}: VIEWPOINT")
     if len(viewpoint) != 7:
         raise DatasetError(f"{path}: VIEWPOINT has {len(viewpoint)} numbers, not tx ty tz qw qx qy qz")
     return PcdHeader(dtype, points, tuple(viewpoint), encoding, start)
@@ -243,13 +240,6 @@ def _stacked(columns: "dict[str, NDArray] | NDArray") -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
         parts = [np.asarray(columns[axis]).reshape(len(columns[axis]), -1)[:, 0] for axis in "xyz"]
     return np.stack([part.astype(np.float64) for part in parts], axis=-1)
-
-
-def _numbers(path: Path, entry: str, words: list[str]) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        raise DatasetError(f"{path}: {entry} contains something that is not a number") from None
 
 
 def _whole(path: Path, entry: str, word: str) -> int:

@@ -181,13 +181,15 @@ def _poses_in(trajectory: Trajectory) -> ChangedPoses:
     return dict(zip(map(kind, keys), poses, strict=True))
 
 
-def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], PoseSource]:
-    """Opener of a text file that ``read`` reads."""
+def watched(
+    read: Callable[[Path], ChangedPoses], beside: tuple[str, ...] = (), is_text: bool = True
+) -> Callable[[Path, str], PoseSource]:
+    """Opener of a file that ``read`` reads, as a WatchedFile."""
 
     def open_file(path: Path, query: str) -> WatchedFile:
         if query:
             raise DatasetError(f"{path}: takes no options after a question mark; bags do")
-        return WatchedFile(path, read)
+        return WatchedFile(path, read, beside, is_text)
 
     return open_file
 
@@ -208,19 +210,19 @@ GRAPH = PoseKind(
     "pose graph",
     f"VERTEX_SE3:QUAT or VERTEX3 lines ({', '.join(SUFFIXES)})",
     is_pose_graph,
-    _watched(lambda path: dict(read_pose_graph(path, with_edges=False).poses.items())),
+    watched(lambda path: dict(read_pose_graph(path, with_edges=False).poses.items())),
 )
 OPEN3D = PoseKind(
     "Open3D trajectory",
     "a PinholeCameraTrajectory or a PoseGraph (.json)",
     lambda path: path.suffix == ".json",
-    _watched(lambda path: _poses_in(_open3d(path))),
+    watched(lambda path: _poses_in(_open3d(path))),
 )
 TRAJECTORY = PoseKind(
     "trajectory",
     "lines of stamp tx ty tz qx qy qz qw (TUM), of 12 or 16 numbers (KITTI), or a .log",
     lambda path: not is_folder(path),
-    _watched(lambda path: _poses_in(read_trajectory(path))),
+    watched(lambda path: _poses_in(read_trajectory(path))),
 )
 
 KINDS: tuple[PoseKind, ...] = (BAG, RTABMAP, GRAPH, OPEN3D, TRAJECTORY)

@@ -12,6 +12,7 @@ choose them.
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -81,12 +82,10 @@ class RosBag(Table[BagRow]):
         metres."""
         shares, depths = [], []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
-            try:
+            with suppress(DatasetError):  # reported when its frame is read
                 message = self.reader.read(self.topic, row.entry)
                 shares.append(messages.share_without(message))
                 depths.append(messages.depth_image(message, None))
-            except DatasetError:  # reported when its frame is read
-                continue
         if self.depth_scale is None:
             check_metres(depths, f"{self.reader.path}: topic {self.topic}")
         return note_of_largest(shares)

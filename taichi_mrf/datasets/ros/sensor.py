@@ -300,7 +300,9 @@ def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: Rea
     fit the images."""
     reader, entries, given = sensor.reader, sensor.entries, options.camera
     if options.intrinsics is not None and given is None:
-        given = PinholeCamera(*_first_size(reader, depth), *options.intrinsics)
+        with naming(f"{reader.path}: topic {depth.name}"):
+            height, width = messages.depth_image(reader.first(depth.name), None).shape
+        given = PinholeCamera(width, height, *options.intrinsics)
     if given is not None:
         return BagCameras({"": [(0.0, StatedCamera(given, given))]}, given)
     if not (wanted or depth.info):
@@ -426,13 +428,6 @@ def _fitted(
     if problem:
         raise DatasetError(f"{reader.path}: the images of {depth.name} have {problem}")
     return cameras
-
-
-def _first_size(reader: TopicSource, depth: DepthTopic) -> tuple[int, int]:
-    """(width, height) of a topic's first image."""
-    with naming(f"{reader.path}: topic {depth.name}"):
-        height, width = messages.depth_image(reader.first(depth.name), None).shape
-    return width, height
 
 
 def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ...]]:

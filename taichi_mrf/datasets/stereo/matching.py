@@ -126,8 +126,7 @@ class StereoRig:
     """Distance of the two cameras in metres."""
 
     def __post_init__(self) -> None:
-        ok = math.isfinite(self.baseline_m) and self.baseline_m > 0
-        if not ok:
+        if not 0 < self.baseline_m < math.inf:
             raise ConfigError(f"stereo baseline_m must be a positive number of metres, not {self.baseline_m}")
 
     def depth(self, disparity_px: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -319,8 +318,7 @@ def _spread(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
     block = np.ones((BLOCK, BLOCK), np.uint8)
     nearest = cv2.dilate(disparity_px, block)
     farthest = cv2.erode(np.where(disparity_px > 0, disparity_px, np.float32(1e4)), block)
-    spread: NDArray[np.float32] = nearest - farthest
-    return spread
+    return nearest - farthest
 
 
 @dataclass(frozen=True)

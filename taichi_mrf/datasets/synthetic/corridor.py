@@ -114,11 +114,6 @@ def corridor_length(rooms: int) -> float:
     return -(-rooms // 2) * PITCH
 
 
-def floor_area_m2(rooms: int) -> float:
-    """Floor of the corridor and its rooms, without walls."""
-    return 2 * HALF_WIDTH * corridor_length(rooms) + rooms * LENGTH * WIDTH
-
-
 def corridor_scene(rooms: int) -> Scene:
     """The corridor with its rooms in the world frame."""
     solids = _shell(rooms)
@@ -229,8 +224,6 @@ def pose_on_path(path: NDArray[np.float64], phase: float) -> Pose:
 STEP_M = 0.02
 """Between neighbouring points of the path."""
 
-EYE_M = 1.5
-
 
 class SmoothPath:
     """The path past some corners, (n, 2) in metres, over a floor at ``floor_z``."""
@@ -253,7 +246,7 @@ class SmoothPath:
         self._places = kept
         self._headings = heading
         self._reached = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(kept, axis=0), axis=1))])
-        self._eye_z = floor_z + EYE_M
+        self._eye_z = floor_z + EYE
 
     @property
     def length_m(self) -> float:
