@@ -229,11 +229,9 @@ class Dataset(ABC):
 
 @dataclass(frozen=True)
 class Row:
-    """One frame in a :class:`Table`; a format adds where its images are.
-
-    ``pose`` is T_world_camera, (4, 4), or reads it: that raises DatasetError, which names the file, or
-    KeyframeError for an invalid pose; ``pose_source`` then names the file, or the file and the line.
-    """
+    """One frame in a :class:`Table`; a format adds where its images are. ``pose`` is T_world_camera, (4, 4),
+    or reads it: that raises DatasetError, which names the file, or KeyframeError for an invalid pose;
+    ``pose_source`` then names the file, or the file and the line."""
 
     name: str
     stamp: float

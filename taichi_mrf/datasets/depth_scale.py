@@ -138,11 +138,9 @@ def gather(
     camera: PinholeCamera,
     candidates: Sequence[float],
 ) -> Evidence:
-    """Compare neighbouring frames at a few places of a recording.
-
-    ``read_steps`` gives the raw depth image (H, W) of a frame, 0 where there is no measurement. Frames that
-    cannot be read (DatasetError, KeyframeError) are passed over.
-    """
+    """Compare neighbouring frames at a few places of a recording. ``read_steps`` gives the raw depth image
+    (H, W) of a frame, 0 where there is no measurement. Frames that cannot be read (DatasetError,
+    KeyframeError) are passed over."""
     medians, differences = [], []
     for first in np.unique(np.linspace(0, frames - 1, _PLACES + 1).astype(int)[:-1] if frames else []):
         try:

@@ -145,12 +145,10 @@ def chosen(dataset: Dataset, indices: Sequence[int]) -> Chosen:
 
 @dataclass
 class Resampled(Derived):
-    """The frames of ``source``, each pixel of them picked from the recorded image.
-
-    ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
-    did not meet the recorded image, which is no measurement. Recorded images are ``turned`` (conventions.py).
-    One in ``stride`` pixels is kept; if they are not ``distorted``, frames may have cameras of their own.
-    """
+    """The frames of ``source``, each pixel of them picked from the recorded image. ``rows`` and ``columns``
+    (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray did not meet the
+    recorded image, which is no measurement. Recorded images are ``turned`` (conventions.py). One in
+    ``stride`` pixels is kept; if they are not ``distorted``, frames may have cameras of their own."""
 
     rows: NDArray[np.int64] = field(kw_only=True)
     columns: NDArray[np.int64] = field(kw_only=True)
@@ -194,12 +192,9 @@ class Resampled(Derived):
 
 def resampled(dataset: Dataset, distortion: Sequence[float], stride: int, turned: str = "") -> Dataset:
     """The dataset with its images put back where they are ``turned`` (conventions.py), undistorted, and one
-    in ``stride`` of their rows and columns kept.
-
-    ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
-    camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
-    left of an image, and if its camera is no pinhole.
-    """
+    in ``stride`` of their rows and columns kept. ``distortion`` are OpenCV's coefficients of the recorded
+    images (none or zeros: they are a pinhole camera's). The camera keeps its intrinsics but for the stride.
+    Raises DatasetError if nothing would be left of an image, and if its camera is no pinhole."""
     distorted = any(distortion)
     if not (distorted or turned) and stride == 1:
         return dataset
@@ -243,11 +238,9 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int, turned
 
 
 def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[int, int]]:
-    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept.
-
-    Its rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
-    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left.
-    """
+    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept. Its
+    rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
+    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left."""
     first = (stride - 1) // 2
     thin = PinholeCamera(
         width=len(range(first, camera.width, stride)),

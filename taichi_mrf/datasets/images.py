@@ -35,10 +35,8 @@ Size = tuple[int, int]
 
 
 def claimed_size(data: bytes) -> Size | None:
-    """(width, height) in pixels by the header of an encoded image.
-
-    None for a damaged header and for other formats than those of KNOWN.
-    """
+    """(width, height) in pixels by the header of an encoded image. None for a damaged header and for other
+    formats than those of KNOWN."""
     read = next((read for signature, read in _READERS if re.match(signature, data, re.DOTALL)), None)
     try:
         size = None if read is None else read(data)
@@ -161,11 +159,8 @@ def read_depth(
     path: Path, steps_per_metre: float, camera: PinholeCamera | None = None
 ) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, from a grey image of 16 bits or of floats, or from NumPy's array
-    of any numbers (.npy), 0 for none.
-
-    Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
-    of another size than the camera's.
-    """
+    of any numbers (.npy), 0 for none. Raises DatasetError, whose text names the file, for an image that is
+    missing, damaged, of another kind, or of another size than the camera's."""
     steps = _values(path, camera)
     if path.suffix == ARRAY and steps.dtype.kind in "ui":
         steps = measured(steps)
@@ -377,12 +372,10 @@ def at_size(camera: PinholeCamera, width: int, height: int) -> str:
 
 def _png_damage(data: bytes, kept: list[bytes]) -> str | None:
     """The damage of a PNG's chunks, or None. They are put into ``kept``, all but texts and colour profiles,
-    which libpng unpacks however large they are.
-
-    Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
-    out the upper part of a cut image with zeros below, which would pass for missing depth. For what is
-    packed, the memory that the header claims is not taken before it is known to be filled.
-    """
+    which libpng unpacks however large they are. Checked here since libpng writes to stderr past every logger,
+    and since some builds of OpenCV hand out the upper part of a cut image with zeros below, which would pass
+    for missing depth. For what is packed, the memory that the header claims is not taken before it is known
+    to be filled."""
     position, packed = len(PNG_SIGNATURE), []
     kept.append(PNG_SIGNATURE)
     while position + _CHUNK_BYTES <= len(data):

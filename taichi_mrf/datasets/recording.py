@@ -127,11 +127,9 @@ class Recording(Table[RecordedFrame]):
         return self.color_camera.registered(color, depth_m, camera)
 
     def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
-        """Compare neighbouring frames at their poses, and note which scale is used and why.
-
-        A scale of the format is replaced by a usual one with which neighbouring frames agree clearly better;
-        one that a file or the caller gives is kept, and a note says that another would agree better.
-        """
+        """Compare neighbouring frames at their poses, and note which scale is used and why. A scale of the
+        format is replaced by a usual one with which neighbouring frames agree clearly better; one that a file
+        or the caller gives is kept, and a note says that another would agree better."""
         apart = max(1, len(self.rows) // _LOOKED_AT)
         looked = [
             look_at_depth(frame.depth_file, frame.camera or self.camera)

@@ -67,10 +67,8 @@ def unexplained(found: Diagnosis) -> Diagnosis:
 
 def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     """Look at some twenty frames, and at the poses around them. ``said`` are conventions that are said of the
-    recording and have not been undone in the dataset.
-
-    Raises DatasetError if the source cannot be read, has no end, or no poses of its own.
-    """
+    recording and have not been undone in the dataset. Raises DatasetError if the source cannot be read, has
+    no end, or no poses of its own."""
     if dataset.endless or dataset.tracked:
         what = "never ends" if dataset.endless else "has no poses that are recorded"
         raise DatasetError(

@@ -215,11 +215,9 @@ def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
 
 
 def read_rig(path: Path, width: int, height: int) -> StereoRig:
-    """The rig of images of ``width`` x ``height`` pixels.
-
-    Raises DatasetError, whose text names the file, if it cannot be read, lacks P0 or P1, or if these are
-    not two equal pinhole cameras, the first at the origin and the second to its right.
-    """
+    """The rig of images of ``width`` x ``height`` pixels. Raises DatasetError, whose text names the file, if
+    it cannot be read, lacks P0 or P1, or if these are not two equal pinhole cameras, the first at the origin
+    and the second to its right."""
     P_left, P_right = _read_projections(path)
     K = P_left[:, :3]
     fx = K[0, 0]

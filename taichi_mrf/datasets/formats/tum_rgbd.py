@@ -113,11 +113,9 @@ def _poses(folder: Path, may_lack: bool) -> Path:
 
 
 def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
-    """For each stamp (seconds) the index of its partner in ``others``, or None.
-
-    No pair is further apart than ``largest_gap``, no partner is given twice, and the closest pairs are
-    made first. Neither list needs to be sorted.
-    """
+    """For each stamp (seconds) the index of its partner in ``others``, or None. No pair is further apart than
+    ``largest_gap``, no partner is given twice, and the closest pairs are made first. Neither list needs to be
+    sorted."""
     order = np.argsort(others, kind="stable")
     ordered = np.asarray(others, dtype=np.float64)[order]
     pairs = []

@@ -112,11 +112,9 @@ def read_pcd_header(path: Path) -> PcdHeader:
 
 
 def read_pcd(path: Path) -> tuple[NDArray[np.float64], Pose]:
-    """Points (N, 3) in metres as they are in the file, NaN included, and the pose in VIEWPOINT.
-
-    Raises DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
-    CapacityError for one that does not fit into memory.
-    """
+    """Points (N, 3) in metres as they are in the file, NaN included, and the pose in VIEWPOINT. Raises
+    DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
+    CapacityError for one that does not fit into memory."""
     data = read_bytes(path, DatasetError)
     header = _pcd_header(path, data[:_LONGEST_HEADER])
     with naming(f"{path}: VIEWPOINT", KeyframeError):
@@ -276,11 +274,9 @@ def read_ply_header(path: Path) -> PlyHeader:
 
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
-    """x, y and z of the vertices, (N, 3), NaN included.
-
-    Raises DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
-    CapacityError for one that does not fit into memory.
-    """
+    """x, y and z of the vertices, (N, 3), NaN included. Raises DatasetError, which names the file and the
+    entry, for a file that is cut short or damaged, and CapacityError for one that does not fit into
+    memory."""
     data = read_bytes(path, DatasetError)
     header = _ply_header(path, data[:_LONGEST_HEADER])
     names = header.dtype.names or ()

@@ -306,11 +306,8 @@ def _pose(path: Path, T_world_sensor: Pose | None, T_sensor_lidar: Pose) -> Pose
 
 def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     """Open a recording with the options after the question mark of its name, and read the stamps of its
-    scans.
-
-    Raises DatasetError, which names the file, if ouster-sdk is not installed, metadata are missing, and if no
-    scan can be read or has a pose.
-    """
+    scans. Raises DatasetError, which names the file, if ouster-sdk is not installed, metadata are missing,
+    and if no scan can be read or has a pose."""
     chosen = parse_options(OusterOptions, query, str(path))
     refuse_image_options(f"{path}", options)
     check_regular(path, DatasetError)

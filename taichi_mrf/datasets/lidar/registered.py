@@ -51,12 +51,10 @@ Points = NDArray[np.float64]
 def in_world(
     count: int, read_pose: Callable[[int], Pose], read_points: Callable[[int], Points]
 ) -> bool | None:
-    """True if points are in the world's frame, False if in the sensor's, None if nothing tells.
-
-    Looks at a few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in
-    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Raises DatasetError
-    if poses are clearly the inverse, or a camera's.
-    """
+    """True if points are in the world's frame, False if in the sensor's, None if nothing tells. Looks at a
+    few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in their file;
+    scans that cannot be read (DatasetError, KeyframeError) are passed over. Raises DatasetError if poses are
+    clearly the inverse, or a camera's."""
     votes, overlaps = [], []
     for first in np.unique(np.linspace(0, count, _PLACES + 1).astype(int)[:_PLACES]) if count else []:
         try:

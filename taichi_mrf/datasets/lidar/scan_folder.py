@@ -322,8 +322,7 @@ def _frame_of(
     clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool, options: ReadOptions
 ) -> tuple[bool, list[str]]:
     """True if points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
-    better, and a note where it is not as documented. Raises DatasetError for poses in other
-    conventions."""
+    better, and a note where it is not as documented. Raises DatasetError for poses in other conventions."""
     found = in_world(
         len(clouds),
         lambda i: pose_of(poses[clouds[i]].read(), options.conventions),

@@ -52,11 +52,9 @@ class PoseSource(Protocol):
         ...
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
-        """All poses that are known now, None if they are those of the last call.
-
-        ``stamp_s`` is the recording's time in seconds, infinite once the recording is over: a source that has
-        times of its own gives what was known then. Does not wait.
-        """
+        """All poses that are known now, None if they are those of the last call. ``stamp_s`` is the
+        recording's time in seconds, infinite once the recording is over: a source that has times of its own
+        gives what was known then. Does not wait."""
         ...
 
 

@@ -259,11 +259,8 @@ class RealSenseCamera(Dataset):
 
 def open_realsense(text: str, options: ReadOptions) -> Dataset:
     """Start the first RealSense camera that is found, or open a recording: ``FILE?option=value&...``, where
-    either may be missing.
-
-    Raises DatasetError for a missing library (with how to install it), for an error of the library, for a
-    wrong option, and for a depth scale, which the camera reports itself.
-    """
+    either may be missing. Raises DatasetError for a missing library (with how to install it), for an error of
+    the library, for a wrong option, and for a depth scale, which the camera reports itself."""
     file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
         raise DatasetError(f"{REALSENSE} takes no depth_scale: the camera reports its own")
@@ -287,8 +284,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
 
 
 def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
-    """The text after the colon, as a file's name and options; options alone need no question
-    mark."""
+    """The text after the colon, as a file's name and options; options alone need no question mark."""
     file, mark, query = text.partition("?")
     if not mark and "=" in text and not exists(Path(text)):
         file, query = "", text

@@ -149,12 +149,9 @@ def _turned(poses: BagPoses) -> BagPoses:
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """Open a bag with the options after the question mark of its name.
-
-    Raises DatasetError, whose text names the file and where it applies the topic, for a bag that cannot be
-    read, missing or ambiguous topics, an unknown camera, and if no image has a
-    pose.
-    """
+    """Open a bag with the options after the question mark of its name. Raises DatasetError, whose text names
+    the file and where it applies the topic, for a bag that cannot be read, missing or ambiguous topics, an
+    unknown camera, and if no image has a pose."""
     chosen = parse_options(SensorChoice, query, str(path))
     if options.track:
         chosen = replace(chosen, poses=TRACK)
@@ -252,12 +249,9 @@ def _rows(reader: RosReader, posed: Sequence[tuple[int, Entry, Pose]]) -> list[B
 
 @dataclass(frozen=True)
 class BagSummary:
-    """The contents of a bag.
-
-    ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the tree's edges
-    in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to add; the first
-    needs the least to be filled in.
-    """
+    """The contents of a bag. ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the
+    tree's edges in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to
+    add; the first needs the least to be filled in."""
 
     topics: Sequence[Topic]
     remarks: dict[str, str]

@@ -136,10 +136,7 @@ _NEIGHBOURS = 1.5
 def organised(points_m: NDArray[np.floating]) -> tuple[Scan, NDArray[np.intp]] | None:
     """The image of points (H, W, 3) in the sensor's frame, where pixels without a point got nothing back, and
     the number, row by row, of each pixel's point, (H, W). None if neighbours in the image are no neighbours
-    in space.
-
-    Rows that are ahead of others by whole columns, as some drivers write them, are shifted back.
-    """
+    in space. Rows that are ahead of others by whole columns, as some drivers write them, are shifted back."""
     height, width = points_m.shape[:2]
     measured = measured_points(points_m)
     if min(height, width) < 2 or measured.mean() < _LEAST_MEASURED:

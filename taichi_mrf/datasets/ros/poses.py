@@ -141,11 +141,8 @@ def find_poses(
     run: BagRun | None = None,
 ) -> BagPoses:
     """The poses of the sensor whose messages are in ``frame``, as the user chose, else from the only source
-    in the bag; ``read`` gives its tree of frames.
-
-    Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
-    or several, or if the named frames are not connected.
-    """
+    in the bag; ``read`` gives its tree of frames. Raises DatasetError, whose text names the file and lists
+    the candidates or the frames, if there are none or several, or if the named frames are not connected."""
     if choice.poses == TRACK:
         return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
     if choice.poses:

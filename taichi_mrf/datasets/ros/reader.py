@@ -243,11 +243,8 @@ class RosReader(TopicSource):
 
     def __init__(self, path: Path) -> None:
         """Open a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or one with the files of a recording
-        that was split.
-
-        Raises DatasetError, whose text names the file, if it is cut short, damaged or of a kind that is not
-        known, if files do not follow each other in time, and if rosbags is not installed.
-        """
+        that was split. Raises DatasetError, whose text names the file, if it is cut short, damaged or of a
+        kind that is not known, if files do not follow each other in time, and if rosbags is not installed."""
         self.path, self.parts = path, parts_of(path)
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):

@@ -431,12 +431,9 @@ def _fitted(
 
 
 def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ...]]:
-    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
-
-    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
-    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
-    OpenCV's.
-    """
+    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none. Images that are
+    ``rectified`` are those of the projection P, and have no distortion left. Raises DatasetError, which does
+    not name the topic, if it is not calibrated, or has a lens model that is not OpenCV's."""
     K, D, P = (_field(info, name) for name in "kdp")
     matrix, projection = K.reshape(3, 3), P.reshape(3, 4)[:, :3]
     # Drivers without a calibration leave K at zero or the identity, and some of them fill P alone.

@@ -114,11 +114,9 @@ def _shared_parts(a: str, b: str) -> int:
 
 
 def choose(reader: TopicSource, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
-    """The topic that the user named, or the only candidate.
-
-    Raises DatasetError, whose text names the file and lists the candidates, if the bag has no topic of that
-    name, if there are several candidates and none was named, or no candidate.
-    """
+    """The topic that the user named, or the only candidate. Raises DatasetError, whose text names the file
+    and lists the candidates, if the bag has no topic of that name, if there are several candidates and none
+    was named, or no candidate."""
     path = reader.path
     if wanted:
         name = wanted if wanted in reader.topics else f"/{wanted}"

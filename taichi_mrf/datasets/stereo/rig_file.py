@@ -2,14 +2,10 @@
 
 ::
 
-    fx: 707.1            # pixels; fy is fx unless it is given
-    cx: 601.9
-    cy: 183.1
-    baseline: 0.537      # metres
-    left: cam0/*.png     # relative to this file, paired in the order of their names
-    right: cam1/*.png
-    poses: poses.txt     # T_world_camera of the left camera, in any layout that trajectories have
-    times: times.txt     # optional: a stamp in seconds for each pair
+fx: 707.1 # pixels; fy is fx unless it is given cx: 601.9 cy: 183.1 baseline: 0.537 # metres left: cam0/*.png
+# relative to this file, paired in the order of their names right: cam1/*.png poses: poses.txt #
+T_world_camera of the left camera, in any layout that trajectories have times: times.txt # optional: a stamp
+in seconds for each pair
 
 Poses with stamps are interpolated at the pairs' own: those of ``times``, else the images' names as seconds,
 or as nanoseconds if they are whole numbers of 16 digits or more. Other poses go with the pairs in their

@@ -19,10 +19,8 @@ def render(
     scene: Scene, camera: PinholeCamera, T_world_camera: Pose, color: bool = True
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
     """Axial depth, (H, W) float32 in metres, 0 where a ray meets nothing, and a shaded picture, (H, W, 3)
-    uint8 RGB, or None without ``color``.
-
-    Taichi has to run, and the camera has to be outside of every solid.
-    """
+    uint8 RGB, or None without ``color``. Taichi has to run, and the camera has to be outside of every
+    solid."""
     depth_m = np.zeros(camera.shape, dtype=np.float32)
     shaded = np.zeros((*camera.shape, 3) if color else (1, 1, 3), dtype=np.float32)
     # A colour picture needs all solids: those that are not in the picture throw shadows into it.

@@ -113,10 +113,8 @@ class RenderOptions:
 
 @dataclass
 class RenderedSequence(Dataset):
-    """Pictures of a scene, with the truth beside them.
-
-    Reading a frame needs Taichi to run (:func:`taichi_mrf.init`), else BackendError.
-    """
+    """Pictures of a scene, with the truth beside them. Reading a frame needs Taichi to run
+    (:func:`taichi_mrf.init`), else BackendError."""
 
     camera: PinholeCamera
     options: RenderOptions = RenderOptions()
@@ -197,11 +195,9 @@ AnySequence = TypeVar("AnySequence", bound=RenderedSequence)
 
 
 def open_scene(kind: type[AnySequence], name: str, query: str, options: ReadOptions) -> AnySequence:
-    """Open a built-in scene with the options after the question mark of its name.
-
-    Raises DatasetError for an option that does not exist (naming the nearest), a value of the wrong type or
-    out of range, and for a depth scale, which rendered depth does not have.
-    """
+    """Open a built-in scene with the options after the question mark of its name. Raises DatasetError for an
+    option that does not exist (naming the nearest), a value of the wrong type or out of range, and for a
+    depth scale, which rendered depth does not have."""
     if options.depth_scale is not None:
         raise DatasetError(f"{name}: takes no depth_scale: its depth is in metres")
     chosen = parse_options(type(kind.options), query, name)

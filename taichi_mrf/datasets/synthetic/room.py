@@ -320,8 +320,7 @@ NAME = "synthetic:room"
 
 @dataclass(frozen=True)
 class RoomOptions(RenderOptions):
-    """The options of the built-in room. At 32 frames the camera takes 6.4 s for its
-    round."""
+    """The options of the built-in room. At 32 frames the camera takes 6.4 s for its round."""
 
     moving: Literal["none", "things", "door", "walker"] = "none"
     """Moving things: none; things that appear, leave and are moved; a door; or a person who walks through. If
