@@ -41,8 +41,7 @@ def reader(place: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of recording in a folder or a file: its entry in the list (entries.py), or a plug
-    (registry.py)."""
+    """A kind of recording in a folder or a file: an entry (entries.py), or a plug (registry.py)."""
 
     name: str
 
@@ -96,8 +95,7 @@ class StatedSensor:
 @dataclass(frozen=True)
 class Arrivals:
     """How the frames of a sensor that runs come: ``rate_hz``, and how old that which was read last is by now,
-    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since it was
-    opened."""
+    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since."""
 
     rate_hz: float
     age_s: float | None
@@ -164,8 +162,7 @@ class Dataset(ABC):
 
     @property
     def stated(self) -> StatedSensor:
-        """Properties of the sensor that the recording states: here a sigma that the confidence is relative
-        to."""
+        """Facts of the sensor that the recording states: here a sigma that the confidence is relative to."""
         if self.confidence is None:
             return StatedSensor()
         return StatedSensor(self.confidence.sigma, True, self.confidence.origin)
@@ -272,8 +269,7 @@ class Table(Dataset, Generic[AnyRow]):
         return [row.stamp for row in self.rows]
 
     def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises FrameError, which names the frame and the file; IndexError outside 0
-        to len - 1."""
+        """Raises FrameError, which names the frame and the file; IndexError outside 0 to len - 1."""
         row = self._row(index)
         try:
             return row.pose() if callable(row.pose) else row.pose

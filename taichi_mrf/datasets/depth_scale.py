@@ -98,7 +98,7 @@ class Evidence:
 
 
 def check_metres(depths: Sequence[Image], where: str) -> None:
-    """Raise DatasetError, whose text begins with ``where``, if floats (H, W) are no plausible metres."""
+    """Raise DatasetError, which begins with ``where``, if floats (H, W) are no plausible metres."""
     values = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths] or [np.zeros(0)])
     median = float(np.median(values)) if len(values) else 0.0
     if median > _NO_METRES:

@@ -57,8 +57,8 @@ def find_camera(
     depth_files: Iterable[Path],
 ) -> tuple[PinholeCamera, list[str]]:
     """The camera of the recording in ``folder``, and a note where it was assumed and not read.
-    ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError, whose text
-    names the file, for an intrinsics file that is not valid."""
+    ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError, which names
+    the file, for an intrinsics file that is not valid."""
     if options.camera is not None:
         return options.camera, []
     if options.intrinsics is not None:
@@ -98,7 +98,7 @@ def own_cameras(
 def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
     """The camera in a file: ``width height fx fy cx cy``, ``fx fy cx cy``, a 3 x 3, 3 x 4 or 4 x 4 matrix,
     lines of ``fx: 525.0``, or YAML or JSON by the file's suffix. ``default`` gives the image size where
-    neither the file nor ``depth_files`` do. Raises DatasetError, whose text names the file."""
+    neither the file nor ``depth_files`` do. Raises DatasetError, which names the file."""
     if path.suffix == ".json":
         return read_intrinsics(path)
     try:
@@ -203,7 +203,7 @@ _LISTS = {"PinholeCameraTrajectory": "parameters", "PoseGraph": "nodes"}
 
 
 def read_intrinsics(path: Path) -> PinholeCamera:
-    """The camera of a PinholeCameraIntrinsic file. Raises DatasetError, whose text names the file."""
+    """The camera of a PinholeCameraIntrinsic file. Raises DatasetError, which names the file."""
     return _json_camera(path, _json_values(path))
 
 
@@ -217,8 +217,7 @@ def is_trajectory_json(path: Path) -> bool:
 
 def read_trajectory_json(path: Path) -> Trajectory:
     """The poses of a trajectory, counted from 0, with the cameras of their images where it holds some. Raises
-    DatasetError, whose text names the file and the entry, if a matrix is missing or has not 16 numbers, or if
-    there is no entry."""
+    DatasetError, which names the file and the entry, if there is none, or a matrix has not 16 numbers."""
     values = _json_values(path)
     entries = values.get(_LISTS[values["class_name"]])
     if not isinstance(entries, list) or not entries:

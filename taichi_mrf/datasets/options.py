@@ -116,9 +116,9 @@ def require(options: object, **bounds: float | tuple[float, float]) -> None:
 
 def parse_options(cls: type[T], query: str, source: str) -> T:
     """Parse ``name=value&name=value`` into a dataclass, whose fields are the options. A field of type str
-    takes its text unchanged, such as a path. Raises DatasetError, whose text names the source, for an option
-    that does not exist (naming the nearest), a value of the wrong type or out of range, and for text that is
-    not of the form name=value."""
+    takes its text unchanged, such as a path. Raises DatasetError, which names the source, for an option that
+    does not exist (naming the nearest), a value of the wrong type or out of range, and for text that is not
+    of the form name=value."""
     texts = {field for field, hint in get_type_hints(cls).items() if hint is str}
     values = {}
     for option in query.split("&") if query else ():

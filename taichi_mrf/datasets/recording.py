@@ -231,8 +231,7 @@ def number_in(name: str) -> int | None:
 
 
 def beside(folder: Path, name: str) -> Path:
-    """A file that a list in a folder names; with a path of another computer that with the same end, if it is
-    there."""
+    """A file that a list in a folder names; of a path of another computer that with the same end, if any."""
     path = folder / name
     try:
         parts = PureWindowsPath(name).parts
@@ -244,8 +243,7 @@ def beside(folder: Path, name: str) -> Path:
 
 
 def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:
-    """A registered colour image with the depth image's pixels. Raises DatasetError if it is not the same
-    view."""
+    """A registered colour image with the depth image's pixels. Raises DatasetError for another view."""
     (height, width), (rows, columns) = camera.shape, color.shape[:2]
     if (rows, columns) == (height, width):
         return color

@@ -29,8 +29,7 @@ from taichi_mrf.system.libraries import library
 Floats = NDArray[np.float64]
 
 _FLAT, _ROUND = 1e-3, math.radians(60)
-"""Angles between the normals of two triangles: below the first they are one plane, above the second the edge
-between them is sharp."""
+"""Angles between the normals of two triangles: below the first they are one plane, above the second sharp."""
 
 _STEP = math.radians(30)
 """Round sides of what is grown have corners so far apart."""

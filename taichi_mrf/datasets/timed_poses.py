@@ -246,9 +246,8 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def read_timed_poses(path: Path) -> TimedPoses:
     """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera. The lines may come in any
-    order; a blank or a comma separates values. Raises DatasetError, whose text names the file and the line,
-    if it is missing, of another layout, or contains no valid pose; warns of invalid ones, which are left
-    out."""
+    order; a blank or a comma separates values. Raises DatasetError, which names the file and the line, if it
+    is missing, of another layout, or contains no valid pose; warns of invalid ones, which are left out."""
     trajectory = read_trajectory(path)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{path}: poses without stamps; expected stamp tx ty tz qx qy qz qw on each line")

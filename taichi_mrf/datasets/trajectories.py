@@ -246,8 +246,8 @@ class Trajectory:
 
 def read_trajectory(path: Path) -> Trajectory:
     """Read a file of poses, recognising its layout by the first line. Warns of stamps that come twice, and of
-    a clock that starts again, of whose runs the longest is read. Raises DatasetError, whose text names the
-    file and the line, if it cannot be read, contains no pose, or a line has too few or too many numbers or
+    a clock that starts again, of whose runs the longest is read. Raises DatasetError, which names the file
+    and the line, if it cannot be read, contains no pose, or a line has too few or too many numbers or
     something that is not a number."""
     lines = lines_of_numbers(path)
     if not lines:

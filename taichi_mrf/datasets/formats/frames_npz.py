@@ -101,8 +101,8 @@ class FramesNpz(Table[NpzFrame]):
 
 
 def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
-    """Open one file, or all files of a folder as one sequence. Raises DatasetError, whose text names the file
-    and the field."""
+    """Open one file, or all files of a folder as one sequence. Raises DatasetError, which names the file and
+    the field."""
     paths = sorted(path.glob("*.npz")) if is_folder(path) else [path]
     name = path.name if is_folder(path) else path.stem
     parts: list[Part] = []

@@ -149,8 +149,7 @@ _SAME = 1e-6
 
 
 def open_pairs(folder: Path, options: ReadOptions) -> Dataset:
-    """List the pairs in the order of their names. One that lacks an image is listed, and named in an error
-    when it is read."""
+    """List the pairs in the order of their names. One that lacks an image raises an error when it is read."""
     if options.depth_scale is not None:
         raise DatasetError(f"{folder}: takes no depth_scale: depth comes from stereo pairs")
     left, right = next(pair for pair in FOLDERS if all((folder / side).is_dir() for side in pair))
@@ -215,9 +214,9 @@ def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
 
 
 def read_rig(path: Path, width: int, height: int) -> StereoRig:
-    """The rig of images of ``width`` x ``height`` pixels. Raises DatasetError, whose text names the file, if
-    it cannot be read, lacks P0 or P1, or if these are not two equal pinhole cameras, the first at the origin
-    and the second to its right."""
+    """The rig of images of ``width`` x ``height`` pixels. Raises DatasetError, which names the file, if it
+    cannot be read, lacks P0 or P1, or if these are not two equal pinhole cameras, the first at the origin and
+    the second to its right."""
     P_left, P_right = _read_projections(path)
     K = P_left[:, :3]
     fx = K[0, 0]

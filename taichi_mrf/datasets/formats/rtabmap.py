@@ -70,8 +70,7 @@ _MOST_PACKED = 1 << 28
 
 @dataclass(frozen=True)
 class Node:
-    """A node: its session, when it was made, in seconds, and the robot's pose by odometry (4, 4), None if it
-    has none."""
+    """A node: its session, its time in seconds, and the robot's pose by odometry (4, 4), if it has one."""
 
     id: int
     session: int
@@ -152,8 +151,7 @@ class RtabmapDatabase:
             yield id, blob
 
     def images(self, id: int, color: bool) -> tuple[bytes, bytes | None]:
-        """A node's encoded depth image, and its colour image if it has one and ``color``. Raises
-        DatasetError."""
+        """A node's encoded depth image, and with ``color`` its colour image, if any. Raises DatasetError."""
         rows = self._rows(f"SELECT depth, {'image' if color else 'NULL'} FROM Data WHERE id = ?", (id,))
         depth, image = next(iter(rows), (None, None))
         self._check(isinstance(depth, bytes), f"node {id} has no depth image")
@@ -233,8 +231,8 @@ class NodeCamera:
 
 
 def node_camera(blob: bytes, version: tuple[int, ...], where: str) -> NodeCamera:
-    """A node's camera. Raises DatasetError, whose text begins with ``where``, for a damaged blob, a stereo
-    pair and several cameras."""
+    """A node's camera. Raises DatasetError, which begins with ``where``, for a damaged blob, a stereo pair
+    and several cameras."""
     with naming(where, DatasetError, KeyframeError, ConfigError):
         return _with_header(blob) if version >= WITH_HEADER else _plain(blob)
 
@@ -317,7 +315,7 @@ def depth_size(data: bytes) -> tuple[int, int] | None:
 
 def decode_depth(data: bytes, where: str, steps_per_metre: float) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, 0 for no measurement. ``steps_per_metre`` is for images of whole
-    numbers. Raises DatasetError, whose text begins with ``where``, for a damaged image."""
+    numbers. Raises DatasetError, which begins with ``where``, for a damaged image."""
     if data.startswith(INVERSE) and len(data) >= _RVL_HEADER:
         a, b = struct.unpack_from("<2f", data, len(INVERSE))
         steps = _whole(data[_RVL_HEADER:], where).astype(np.float32)

@@ -30,8 +30,7 @@ LARGEST_RATIO = 88
 
 
 def unpack_lzf(packed: bytes, size: int) -> bytes:
-    """The ``size`` bytes that are packed. Raises ValueError if they are others, or refer to what is not
-    there."""
+    """The ``size`` bytes that are packed. Raises ValueError if they are others, or refer to others."""
     out, at, end = bytearray(), 0, len(packed)
     while at < end:
         control = packed[at]
@@ -275,8 +274,7 @@ def read_ply_header(path: Path) -> PlyHeader:
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
     """x, y and z of the vertices, (N, 3), NaN included. Raises DatasetError, which names the file and the
-    entry, for a file that is cut short or damaged, and CapacityError for one that does not fit into
-    memory."""
+    entry, for a damaged file, and CapacityError for one that does not fit into memory."""
     data = read_bytes(path, DatasetError)
     header = _ply_header(path, data[:_LONGEST_HEADER])
     names = header.dtype.names or ()

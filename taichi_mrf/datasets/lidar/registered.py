@@ -173,8 +173,7 @@ def _distances(first: Points, second: Points, T_first: Pose, T_second: Pose) -> 
 
 
 def _thinned(points: Points, most: int) -> Points:
-    """At most so many of the points (N, 3), one in a cell: the rings of a lidar move with it, and are no
-    surfaces."""
+    """At most so many of the points (N, 3), one in a cell: the rings of a lidar are no surfaces."""
     points = points[np.random.default_rng(0).permutation(len(points))]
     _, first = np.unique(np.floor(points / _CELL_M), axis=0, return_index=True)
     return points[np.sort(first)[:most]]

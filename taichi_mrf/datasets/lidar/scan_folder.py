@@ -206,8 +206,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """List the clouds in the order of their stamps. Raises DatasetError, which names the folder
-    or the file."""
+    """List the clouds in the order of their stamps. Raises DatasetError, which names folder or file."""
     chosen = parse_options(FolderOptions, query, str(path))
     clouds = clouds_of(path)
     poses = Path(chosen.poses) if chosen.poses else find_poses(path) if is_folder(path) else None
@@ -258,8 +257,7 @@ def _read_metres(cloud: Path, options: ReadOptions) -> NDArray[np.float64]:
 
 
 def clouds_of(folder: Path) -> list[Path]:
-    """The clouds in a folder, or in the one below it that has some, all of the kind of the first. A file
-    is one itself."""
+    """The clouds in a folder or one below it, all of the kind of the first. A file is one itself."""
     if is_file(folder):
         return [folder] if folder.suffix.lower() in READERS else []
     for place in CLOUD_PLACES:

@@ -53,8 +53,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Motion:
-    """When and where a lidar measured: the ``stamp`` of a scan in seconds, the lidar's pose then, and its
-    pose at any time."""
+    """When and where a lidar measured: the ``stamp`` of a scan in seconds, its pose then and at any time."""
 
     stamp: float
     T_world_lidar: Pose

@@ -129,8 +129,7 @@ class WatchedFile:
         return self._error if lasts else None
 
     def read_now(self) -> ChangedPoses:
-        """The poses as they are now. Raises DatasetError, which names the file and the line, if they cannot
-        be read."""
+        """The poses as they are now. Raises DatasetError, which names the file and the line."""
         self._seen, self._seen_at, self._is_read = self._signature(), self._clock(), True
         return self._read(self._path)
 
@@ -228,7 +227,7 @@ KINDS: tuple[PoseKind, ...] = (BAG, RTABMAP, GRAPH, OPEN3D, TRAJECTORY)
 
 def open_pose_source(name: str | Path) -> PoseSource:
     """Open a file of poses, which may follow later if its name says of which kind it is; options of a bag
-    follow a question mark. Raises DatasetError, whose text names the file."""
+    follow a question mark. Raises DatasetError, which names the file."""
     text, query = str(name), ""
     if not exists(text) and "?" in text:
         text, _, query = text.rpartition("?")

@@ -55,9 +55,8 @@ def is_pose_graph(path: Path) -> bool:
 
 
 def read_pose_graph(path: Path, with_edges: bool = True) -> PoseGraph:
-    """Read a graph, or its vertices alone. Raises DatasetError, whose text names the file and the line, if it
-    cannot be read, holds no pose in space, or a line does not hold the numbers that its first word
-    promises."""
+    """Read a graph, or its vertices alone. Raises DatasetError, which names the file and the line, if it
+    cannot be read, holds no pose in space, or a line has not the numbers that it should."""
     poses: dict[int, Pose] = {}
     keys: dict[int, int] = {}
     edges: list[PoseEdge] = []

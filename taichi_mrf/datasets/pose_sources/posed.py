@@ -119,8 +119,7 @@ class FramePoses:
         self.changes += 1
 
     def of(self, name: str, stamp_s: float) -> Pose | None:
-        """The pose (4, 4) of the frame with this name that was taken at this time; None if the source has
-        none."""
+        """The pose (4, 4) of the frame of this name and time; None if the source has none."""
         pose = self._poses.get(name)
         if pose is not None or not len(self._timed) or not math.isfinite(stamp_s):
             return pose
@@ -185,8 +184,7 @@ class PosedFrames(Chosen):
         return replace(frame, T_world_camera=T_world_camera, origin_m=origin_m)
 
     def pose_now(self, name: str, stamp_s: float) -> Pose | None:
-        """The present pose (4, 4) of the frame with this name that was taken at this time; None if it is
-        the recorded one."""
+        """The present pose (4, 4) of the frame of this name and time; None if it is the recorded one."""
         T_world_camera = self.poses.of(name, stamp_s)
         index = self._index_of.get(name)
         if T_world_camera is not None or index is None:

@@ -200,8 +200,7 @@ class RealSenseOptions:
 class RealSenseCamera(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step;
     ``align`` is the library's, which brings colour to the depth camera's pixels, None without colour;
-    ``motion`` is its IMU, None if it has none or is not tracked; ``started`` says whether an
-    image has come."""
+    ``motion`` is its IMU, None if it has none or is not tracked; ``started`` if an image has come."""
 
     pipeline: Any = None
     align: Any = None
@@ -333,8 +332,7 @@ def _open_camera(
 
 
 def _started(rs: Any, wanted: RealSenseOptions, color: bool) -> tuple[Any, Any] | str:
-    """A pipeline that has been started, and its profile; what the library says if it cannot be. The colour
-    stream may have any size."""
+    """A started pipeline and its profile, or what the library says. The colour stream may have any size."""
     pipeline, config = rs.pipeline(), rs.config()
     config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
     if color:

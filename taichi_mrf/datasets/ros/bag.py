@@ -78,8 +78,7 @@ class RosBag(Table[BagRow]):
     acceleration: AccelerationSamples | None = None
 
     def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
-        """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
-        metres."""
+        """A note of whole numbers that are no measurements. Raises DatasetError if floats are no metres."""
         shares, depths = [], []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
             with suppress(DatasetError):  # reported when its frame is read
@@ -149,8 +148,8 @@ def _turned(poses: BagPoses) -> BagPoses:
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """Open a bag with the options after the question mark of its name. Raises DatasetError, whose text names
-    the file and where it applies the topic, for a bag that cannot be read, missing or ambiguous topics, an
+    """Open a bag with the options after the question mark of its name. Raises DatasetError, which names the
+    file and where it applies the topic, for a bag that cannot be read, missing or ambiguous topics, an
     unknown camera, and if no image has a pose."""
     chosen = parse_options(SensorChoice, query, str(path))
     if options.track:
@@ -266,7 +265,7 @@ class BagSummary:
 
 
 def summarise(path: Path) -> BagSummary:
-    """Look into a bag. Raises DatasetError, whose text names the file, if it cannot be read."""
+    """Look into a bag. Raises DatasetError, which names the file, if it cannot be read."""
     reader = RosReader(path)
     try:
         return summary_of(reader)

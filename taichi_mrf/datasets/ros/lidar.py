@@ -252,8 +252,7 @@ class LidarBag(LidarRecording, Table[BagRow]):
         return self.clouds.frame(row.entry, message, T_world_camera, row.stamp, row.name)
 
     def look_at_first(self, what: str = "cloud") -> None:
-        """Set camera, reach and a note from the first cloud that can be read. Raises DatasetError as for any
-        lidar."""
+        """Set camera, reach and a note from the first cloud that can be read. Raises as for any lidar."""
         super().look_at_first(what)
         self.notes.append(self.clouds.in_words(self.camera))
         if self.clouds.registered:
@@ -336,7 +335,7 @@ def find_clouds(
     reader: TopicSource, choice: SensorChoice, options: ReadOptions
 ) -> tuple[BagSensor, dict[str, BagPoses], Clouds]:
     """The point clouds that are mapped, as the user chose, else the only ones, their poses by frames, and how
-    they become frames. Raises DatasetError, whose text names the source and lists the candidates."""
+    they become frames. Raises DatasetError, which names the source and lists the candidates."""
     refuse_image_options(f"{reader.path}", options)
     topic = choose(reader, "points", choice.points, cloud_topics(reader), "topics of point clouds")
     if reader.topics[topic].type != messages.POINT_CLOUD:

@@ -192,8 +192,7 @@ def grey_image(message: Any) -> NDArray[np.uint8]:
 
 
 def pose_of(message: Any) -> Pose:
-    """T_parent_child, (4, 4), of a message of one of the types POSES. Raises KeyframeError if it is no
-    pose."""
+    """T_parent_child, (4, 4), of a message of a type of POSES. Raises KeyframeError if it is no pose."""
     if hasattr(message, "transform"):
         return _pose(message.transform.translation, message.transform.rotation)
     pose = message.pose

@@ -67,8 +67,7 @@ class PoseHistory:
 
 def open_history(path: Path, query: str) -> PoseHistory:
     """The poses that a bag tells, chosen by options after the question mark: ``pose``, ``body``, ``optical``,
-    ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, which names the file
-    and the topic."""
+    ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, naming file and topic."""
     choice = parse_options(PoseChoice, query, str(path))
     if choice.poses:
         raise DatasetError(f"{path}: ?poses= does not go with --poses; ?pose= names a topic, or tf")

@@ -141,8 +141,8 @@ def find_poses(
     run: BagRun | None = None,
 ) -> BagPoses:
     """The poses of the sensor whose messages are in ``frame``, as the user chose, else from the only source
-    in the bag; ``read`` gives its tree of frames. Raises DatasetError, whose text names the file and lists
-    the candidates or the frames, if there are none or several, or if the named frames are not connected."""
+    in the bag; ``read`` gives its tree of frames. Raises DatasetError, which names the file and lists the
+    candidates or the frames, if there are none or several, or if the named frames are not connected."""
     if choice.poses == TRACK:
         return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
     if choice.poses:
@@ -364,8 +364,7 @@ Sent = list[tuple[Entry, Pose]]
 def _one_body(
     where: str, sent: dict[tuple[str, str], Sent], choice: PoseChoice
 ) -> tuple[tuple[str, str], Sent]:
-    """The poses of one body in one frame, and the two; messages that name neither are of the only ones that
-    others name."""
+    """The poses of one body in one frame, and the two; messages without these are of the only ones named."""
     parents, children = ({pair[i] for pair in sent if pair[i]} for i in (0, 1))
     for named, wanted, option in ((parents, choice.frame, "frame"), (children, choice.body, "body")):
         if len(named) > 1:

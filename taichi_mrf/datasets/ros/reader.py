@@ -96,8 +96,7 @@ def _sum_first(opens: Callable[[Any], None], sizes: Callable[[Any], Iterable[int
 
 
 def _held_to_sizes(reader: Any) -> Iterator[int]:
-    """The sizes of a ROS 1 bag's chunks by their headers, which rosbags passes over; the unpackers keep to
-    them."""
+    """The sizes of a ROS 1 bag's chunks by headers that rosbags passes over; the unpackers keep to them."""
     ros1 = importlib.import_module("rosbags.rosbag1.reader")
     for place, chunk in reader.chunks.items():
         reader.bio.seek(place)
@@ -152,8 +151,7 @@ def _channel_of(connection: Any, is2: bool) -> Channel:
 
 
 def msgtype_of(connection: Any) -> str:
-    """The type of a connection's messages as ROS 2 writes it; in an MCAP file converted from ROS 1 it is
-    written in another way."""
+    """The type of a connection's messages as ROS 2 writes it, also in an MCAP file converted from ROS 1."""
     is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1
     return ros2_name(connection.msgtype) if is_ros1 else connection.msgtype
 
@@ -243,8 +241,8 @@ class RosReader(TopicSource):
 
     def __init__(self, path: Path) -> None:
         """Open a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or one with the files of a recording
-        that was split. Raises DatasetError, whose text names the file, if it is cut short, damaged or of a
-        kind that is not known, if files do not follow each other in time, and if rosbags is not installed."""
+        that was split. Raises DatasetError, which names the file, if it is cut short, damaged or of a kind
+        that is not known, if files do not follow each other in time, and if rosbags is not installed."""
         self.path, self.parts = path, parts_of(path)
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):

@@ -1,5 +1,4 @@
-"""The messages of a bag's sensor that are mapped, their poses, and the cameras that took them, out of a
-CameraInfo."""
+"""The messages of a bag's sensor that are mapped, their poses, and their cameras, out of a CameraInfo."""
 
 from bisect import bisect_right
 from collections import Counter
@@ -180,8 +179,8 @@ class DepthCamera(NamedTuple):
 
 
 def find_depth_camera(reader: TopicSource, choice: SensorChoice, options: ReadOptions) -> DepthCamera:
-    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
-    text names the source and lists the candidates."""
+    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, which
+    names the source and lists the candidates."""
     depth = choose_depth(reader, choice.depth)
     sensor = find_sensor(reader, depth.name, "images", choice)
     cameras = find_cameras(sensor, depth, choice.info, options)
@@ -296,8 +295,7 @@ class BagCameras:
 
 def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:
     """The cameras of a topic's images, given by the user or by CameraInfo on the topic ``wanted`` or the only
-    one that fits. Raises DatasetError, which names file, topic and remedy, if they are not known or do not
-    fit the images."""
+    one that fits. Raises DatasetError, which names file, topic and remedy, if none is known or fits."""
     reader, entries, given = sensor.reader, sensor.entries, options.camera
     if options.intrinsics is not None and given is None:
         with naming(f"{reader.path}: topic {depth.name}"):

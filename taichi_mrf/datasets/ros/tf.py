@@ -237,8 +237,7 @@ def tree_of(
 ) -> TransformTree:
     """The tree of frames of the sensor whose messages are on ``topic`` and in ``frame``. Transforms on a
     topic called tf_static are fixed; the last message counts. ``tf`` is the option of that name. Raises
-    DatasetError, which does not name the file, if several trees may be the sensor's, or if ``tf`` names
-    nothing."""
+    DatasetError, which does not name the file, if several trees may be its own, or ``tf`` names none."""
     publishers = sorted(
         {each.publisher for all_ in sent.values() for some in all_.values() for each in some} - {""}
     )

@@ -19,8 +19,7 @@ FROM_TF = "tf"
 
 @dataclass(frozen=True)
 class DepthTopic:
-    """A topic of depth images: their encoding, their camera's frame, and the CameraInfo topics that may be
-    its."""
+    """A topic of depth images: encoding, their camera's frame, and the CameraInfo topics that may be its."""
 
     name: str
     encoding: str
@@ -114,9 +113,9 @@ def _shared_parts(a: str, b: str) -> int:
 
 
 def choose(reader: TopicSource, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
-    """The topic that the user named, or the only candidate. Raises DatasetError, whose text names the file
-    and lists the candidates, if the bag has no topic of that name, if there are several candidates and none
-    was named, or no candidate."""
+    """The topic that the user named, or the only candidate. Raises DatasetError, which names the file and
+    lists the candidates, if the bag has no topic of that name, if there are several candidates and none was
+    named, or no candidate."""
     path = reader.path
     if wanted:
         name = wanted if wanted in reader.topics else f"/{wanted}"

@@ -77,7 +77,7 @@ class RigFile:
 
 
 def open_file(path: Path, options: ReadOptions) -> Dataset:
-    """List the pairs of a description. Raises DatasetError, whose text names the file and the field."""
+    """List the pairs of a description. Raises DatasetError, which names the file and the field."""
     described, folder = _read(path), path.parent
     if options.depth_scale is not None:
         raise DatasetError(f"{path}: takes no depth_scale: depth comes from stereo pairs")

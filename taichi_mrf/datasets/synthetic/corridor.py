@@ -381,8 +381,7 @@ LAMP_OVER_EYE_M = 0.6
 
 @dataclass
 class Walked(RenderedSequence):
-    """A walk as a sequence of frames, from its beginning to its end, in the light of a lamp over the
-    camera."""
+    """A walk as a sequence of frames, from beginning to end, in the light of a lamp over the camera."""
 
     def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:
         x, y, z = T_world_camera[:3, 3].tolist()

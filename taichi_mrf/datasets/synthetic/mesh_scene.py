@@ -105,8 +105,8 @@ class MeshScene:
 
 def load_mesh(path: Path) -> TriangleMesh:
     """Read a triangle mesh from a PLY, OBJ, STL, OFF or glTF file, its parts joined into one. Raises
-    DatasetError, whose text names the file, if trimesh is not installed, if the file is missing or cannot be
-    read as a mesh, and for a mesh without triangles or with vertices that are not finite."""
+    DatasetError, which names the file, if trimesh is not installed, if the file is missing or cannot be read
+    as a mesh, and for a mesh without triangles or with vertices that are not finite."""
     trimesh = _library("trimesh")
     if not is_file(path):
         raise DatasetError(f"{path}: {'is not a file' if exists(path) else 'the mesh is missing'}")
@@ -250,10 +250,9 @@ class MeshSequence(Table[Row]):
 
 
 def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
-    """Open ``FILE?poses=FILE&...``, what follows ``mesh:`` in a source's name. Raises DatasetError, whose
-    text names the file or the option, for a mesh or a file of poses that cannot be read, for a wrong option,
-    for a depth scale, which rendered depth does not have, and if the libraries that meshes need are not
-    installed."""
+    """Open ``FILE?poses=FILE&...``, what follows ``mesh:`` in a source's name. Raises DatasetError, which
+    names the file or the option, for a mesh or poses that cannot be read, a wrong option, a depth scale,
+    which rendered depth does not have, and if the libraries that meshes need are missing."""
     file, _, query = source.partition("?")
     name = f"{NAME}{file}"
     if not file:

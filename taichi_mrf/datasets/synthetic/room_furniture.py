@@ -34,8 +34,7 @@ def room_scene() -> Scene:
 
 
 def room_solids(doorway: Sequence[Solid] = ()) -> list[Solid]:
-    """All solids in the room's own frame. ``doorway`` replaces the wall at the lowest y and the shut door in
-    it."""
+    """All solids in the room's own frame. ``doorway`` replaces the wall at the lowest y and its door."""
     return [
         *_shell(doorway or [_near_wall()]),
         *(() if doorway else _shut_door()),
