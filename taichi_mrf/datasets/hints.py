@@ -29,7 +29,6 @@ LIDAR_POSES = (
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info", ".json")
 
-
 AS_NPZ = (
     "write them as an .npz with depth_m (N, H, W) in metres, T_world_camera (N, 4, 4) and K (3, 3), or as "
     "16-bit PNGs NNNN.png with camera.txt (width height fx fy cx cy) and poses.txt (for each image the 12 "

@@ -141,7 +141,6 @@ _TIFF_KINDS = {3: "H", 4: "I"}
 _LARGEST_TILE = 1 << 20
 """Pixels of a tile that is larger than its image; small images have tiles of 256 x 256."""
 
-
 ARRAY = ".npy"
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 """Of depth images that folders may hold."""

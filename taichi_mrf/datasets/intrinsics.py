@@ -50,11 +50,7 @@ SCENE_FILE = "camera-intrinsics.txt"
 
 
 def find_camera(
-    folder: Path,
-    options: ReadOptions,
-    default: PinholeCamera,
-    default_name: str,
-    depth_files: Iterable[Path],
+    folder: Path, options: ReadOptions, default: PinholeCamera, default_name: str, depth_files: Iterable[Path]
 ) -> tuple[PinholeCamera, list[str]]:
     """The camera of the recording in ``folder``, and a note where it was assumed and not read.
     ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError, which names

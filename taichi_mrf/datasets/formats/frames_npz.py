@@ -137,10 +137,7 @@ def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
         count = shape[0] if len(shape) == 3 else 1
         unposed = options.track and POSE not in file
         poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _numbers(file, path, POSE)
-        if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in (
-            (4, 4),
-            (3, 4),
-        ):
+        if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in ((4, 4), (3, 4)):
             raise DatasetError(f"{path}: {POSE} is {poses.shape}; expected ({count}, 4, 4)")
         stamps = _numbers(file, path, STAMP).reshape(-1) if STAMP in file else first + np.arange(count)
         if stamps.shape != (count,):

@@ -39,10 +39,7 @@ class FloorPlan:
     def upper_x_y(self) -> tuple[float, float]:
         """The image's upper right corner in metres."""
         height, width = self.wall.shape
-        return (
-            self.lower_x_y[0] + width * self.pixel_x_y[0],
-            self.lower_x_y[1] + height * self.pixel_x_y[1],
-        )
+        return (self.lower_x_y[0] + width * self.pixel_x_y[0], self.lower_x_y[1] + height * self.pixel_x_y[1])
 
     def moved(self, x: float, y: float) -> "FloorPlan":
         """The plan, shifted by ``x`` and ``y`` metres."""

@@ -198,10 +198,7 @@ BAG = PoseKind(
     reader("ros.pose_history:open_history"),
 )
 RTABMAP = PoseKind(
-    "RTAB-Map",
-    "a database (.db)",
-    lambda path: path.suffix == ".db",
-    reader("formats.rtabmap:open_poses"),
+    "RTAB-Map", "a database (.db)", lambda path: path.suffix == ".db", reader("formats.rtabmap:open_poses")
 )
 GRAPH = PoseKind(
     "pose graph",

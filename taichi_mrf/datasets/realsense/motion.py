@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.motion import (
-    AT_REST_S,
-    MOST_SAMPLES,
-    AccelerationSamples,
-    GyroSamples,
-    upwards_at,
-)
+from taichi_mrf.sensor.motion import AT_REST_S, MOST_SAMPLES, AccelerationSamples, GyroSamples, upwards_at
 
 LEAST_HZ = 100
 """Of the rates that the camera offers the lowest from here on is taken."""

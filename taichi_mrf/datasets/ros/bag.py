@@ -55,7 +55,6 @@ from taichi_mrf.sensor.ray_table import RayTable
 REALSENSE = "/device_0/sensor_"
 """The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
 
-
 _AGREE = 0.03
 """Neighbouring images whose depths differ by less, as a share of them, agree."""
 

@@ -129,7 +129,6 @@ def _grades(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""
 
-
 ImuRow = tuple[float, ...]
 """A measurement of an IMU in its own frame: stamp in seconds, angular rates, accelerations (7 numbers)."""
 

@@ -37,7 +37,6 @@ NO_POSES = (
     "images"
 )
 
-
 KEPT_S = 10.0
 """Poses of a robot that runs are kept for so many seconds."""
 

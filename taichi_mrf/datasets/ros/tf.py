@@ -27,7 +27,6 @@ from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 Edge = Pose | TimedPoses
 """T_parent_child, (4, 4), or such poses with stamps."""
 
-
 WORLDS = ("map", "odom", "world", "earth", "utm")
 """Frames that are fixed by their names (REP 105), and no body."""
 
@@ -229,11 +228,7 @@ Transforms = dict[str, list[_Sent]]
 
 
 def tree_of(
-    sent: dict[str, Transforms],
-    topic: str,
-    frame: str,
-    tf: str = "",
-    run: BagRun | None = None,
+    sent: dict[str, Transforms], topic: str, frame: str, tf: str = "", run: BagRun | None = None
 ) -> TransformTree:
     """The tree of frames of the sensor whose messages are on ``topic`` and in ``frame``. Transforms on a
     topic called tf_static are fixed; the last message counts. ``tf`` is the option of that name. Raises

@@ -314,7 +314,6 @@ def _person() -> tuple[Solid, ...]:
 SCRIPTS: dict[str, Callable[[int], MovingScene]] = {"things": _things, "door": _door, "walker": _walker}
 """The scripts by name, in the room's own frame; each takes a variant."""
 
-
 NAME = "synthetic:room"
 
 

@@ -97,10 +97,7 @@ def _shell(near_wall: Sequence[Solid]) -> list[Solid]:
 
 
 def _shut_door() -> list[Solid]:
-    return [
-        box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD),
-        sphere(1.85, -2.40, 1.05, 0.035, METAL),
-    ]
+    return [box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD), sphere(1.85, -2.40, 1.05, 0.035, METAL)]
 
 
 def _window_and_picture() -> list[Solid]:
