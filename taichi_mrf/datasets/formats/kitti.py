@@ -58,7 +58,8 @@ def open_scans(path: Path, options: ReadOptions) -> Dataset:
     """List the scans in the order of their numbers. Raises DatasetError, which names the file and line."""
     folder = velodyne_sequence(path)
     assert folder is not None
-    files = _scans(folder)
+    every = (folder / SCANS).iterdir() if is_folder(folder / SCANS) else ()
+    files = sorted((file for file in every if file.suffix == ".bin" and is_file(file)), key=natural)
     T_camera_lidar = read_calibration(folder / CALIBRATION)
     poses = _poses_of_scans(folder)
     notes, stamps = [], None
@@ -114,11 +115,6 @@ def read_calibration(path: Path) -> Pose:
         raise DatasetError(f"{path}: Tr must be 12 numbers") from None
     with naming(f"{path}: Tr", KeyframeError):
         return as_pose(matrix)
-
-
-def _scans(folder: Path) -> list[Path]:
-    files = (folder / SCANS).iterdir() if is_folder(folder / SCANS) else ()
-    return sorted((file for file in files if file.suffix == ".bin" and is_file(file)), key=natural)
 
 
 def _poses_of_scans(folder: Path) -> Trajectory:

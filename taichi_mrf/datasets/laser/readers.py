@@ -213,21 +213,6 @@ FILE_NAME = "scans.npz"
 _ZIP_MAGIC = b"PK"
 
 
-def _is_npz(path: Path) -> bool:
-    """True if a file is of this format, damaged or not."""
-    with open_regular(path, DatasetError) as file:
-        return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
-
-
-def holds_ranges(path: Path) -> bool:
-    """True if an npz file has an array of ranges."""
-    try:
-        with open_npz(path, DatasetError, "an npz file that can be read") as file:
-            return "range_m" in file
-    except DatasetError:
-        return False
-
-
 def read_scan_npz(
     path: Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
 ) -> LaserScans:
@@ -321,9 +306,10 @@ def open_scans(
             f"{source}: no such file, and no built-in scans of that name ({floor_plan_scans.NAME})"
         )
     try:
-        if _is_npz(path):
-            return read_scan_npz(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
-        return read_carmen_log(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
+        with open_regular(path, DatasetError) as file:
+            is_npz = file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
+        read = read_scan_npz if is_npz else read_carmen_log
+        return read(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -334,9 +320,10 @@ def holds_scans(path: Path) -> bool:
         path = path / FILE_NAME
     if not is_file(path):
         return False
-    if path.suffix == ".npz":
-        return holds_ranges(path)
     try:
+        if path.suffix == ".npz":
+            with open_npz(path, DatasetError, "an npz file that can be read") as arrays:
+                return "range_m" in arrays
         with open_regular(path, DatasetError) as file:
             head = file.read(_LOOKED_AT_BYTES) or b""  # None: a device without news
         if head[:2] == GZIP_MAGIC:

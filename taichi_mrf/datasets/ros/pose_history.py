@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from taichi_mrf.datasets.options import parse_options
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import PATH
 from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_connect, pose_candidates
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
@@ -96,7 +95,7 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
     if name == FROM_TF:
         return _from_tree(reader, tree, optical, choice)
     name = choose(reader, "pose", name, paths, "topics of poses")
-    if reader.topics[name].type == PATH:
+    if reader.topics[name].type == messages.PATH:
         return _from_paths(reader, name, tree, optical, choice, run)
     return _from_poses(reader, name, optical, choice, tree, run)
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
@@ -267,7 +266,8 @@ def _from_topic(
 
     def hear(topic: Topic, entry: Entry, message: Any) -> None:
         hear_tf(topic, entry, message)
-        if topic.name == name and _is_of(entry, message, parent, child):
+        of = messages.frame_name(getattr(message, "child_frame_id", ""))
+        if topic.name == name and entry.frame in ("", parent) and of in ("", child):
             pose = _valid_pose(message)
             if pose is not None:
                 timed.add(entry.stamp, pose, KEPT_S)
@@ -284,11 +284,6 @@ def _from_topic(
         hear=hear,
         moving=moving,
     )
-
-
-def _is_of(entry: Entry, message: Any, parent: str, child: str) -> bool:
-    """True if a pose is of a body in a frame, or does not say otherwise."""
-    return entry.frame in ("", parent) and frame_name(getattr(message, "child_frame_id", "")) in ("", child)
 
 
 def _valid_pose(message: Any) -> Pose | None:
@@ -316,8 +311,8 @@ def _read_poses(
         if pose is None:
             broken += 1
             continue
-        child = frame_name(getattr(message, "child_frame_id", ""))
-        if topic.type != messages.PATH and not header_ns(message.header):
+        child = messages.frame_name(getattr(message, "child_frame_id", ""))
+        if topic.type != messages.PATH and not messages.header_ns(message.header):
             unstamped.add(entry)
         sent.setdefault((entry.frame, child), []).append((entry, pose))
     if not sent:
@@ -352,8 +347,8 @@ def _of_path(reader: TopicSource, name: str) -> Iterator[tuple[Entry, Any]]:
     """The poses of the last message of a Path, which has all of them."""
     for entry, message in deque(reader.messages(name), maxlen=1):
         for i, each in enumerate(message.poses):
-            stamp = header_ns(each.header) / NANOSECONDS or entry.stamp
-            frame = frame_name(each.header.frame_id) or entry.frame
+            stamp = messages.header_ns(each.header) / NANOSECONDS or entry.stamp
+            frame = messages.frame_name(each.header.frame_id) or entry.frame
             yield replace(entry, ordinal=i, stamp=stamp, frame=frame), each
 
 

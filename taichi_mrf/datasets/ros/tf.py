@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
@@ -286,7 +285,7 @@ def _sent_in(topic: str, entry: Entry, message: Any) -> Iterator[tuple[str, _Sen
     """The transforms in a message, by the frames that they are of."""
     is_static = topic.endswith("tf_static")
     for each in message.transforms:
-        parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+        parent, child = messages.frame_name(each.header.frame_id), messages.frame_name(each.child_frame_id)
         try:
             pose = as_pose(messages.pose_of(each))
         except KeyframeError:

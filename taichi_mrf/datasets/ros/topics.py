@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.sources import TopicSource
 from taichi_mrf.errors import DatasetError, naming
 
@@ -80,7 +79,7 @@ def cloud_topics(reader: TopicSource) -> list[str]:
 def message_frame(reader: TopicSource, topic: str) -> str:
     """The coordinate frame of a topic's first message, empty if there is none."""
     message = reader.first(topic)
-    return "" if message is None else frame_name(message.header.frame_id)
+    return "" if message is None else messages.frame_name(message.header.frame_id)
 
 
 def described(reader: TopicSource, name: str) -> DepthTopic:
@@ -92,7 +91,7 @@ def described(reader: TopicSource, name: str) -> DepthTopic:
     message = reader.first(name)
     if message is None:
         raise DatasetError(f"{reader.path}: topic {name} contains no message")
-    frame = frame_name(message.header.frame_id)
+    frame = messages.frame_name(message.header.frame_id)
     return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name, frame))
 
 
