@@ -34,9 +34,9 @@ def start_pose(up: NDArray[np.float64] | None = None) -> Pose:
     return T
 
 
-def reader(place: str) -> Callable[..., Any]:
-    """Opener of a source, "module:function" in this package, which is imported when it is called."""
-    return lambda *arguments: resolve_name(f"taichi_mrf.datasets.{place}")(*arguments)
+def when_called(place: str) -> Callable[..., Any]:
+    """The function at a place, "module:function", which is imported when it is called."""
+    return lambda *arguments: resolve_name(place)(*arguments)
 
 
 @dataclass(frozen=True)

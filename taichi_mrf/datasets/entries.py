@@ -9,8 +9,9 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from taichi_mrf.datasets.base import BuiltIn, Format, reader
+from taichi_mrf.datasets.base import BuiltIn, Format, when_called
 from taichi_mrf.datasets.ros.names import METADATA, SUFFIXES, is_bag
 from taichi_mrf.system.files import is_file, is_folder
 
@@ -103,6 +104,11 @@ def _is_scan_folder(path: Path) -> bool:
     places = (path / place for place in CLOUD_PLACES)
     may_be = any(c.suffix.lower() in CLOUDS for place in places if is_folder(place) for c in place.iterdir())
     return may_be and reader("lidar.scan_folder:recognises")(path)
+
+
+def reader(place: str) -> Callable[..., Any]:
+    """Opener of a source, "module:function" in this package, which is imported when it is called."""
+    return when_called(f"taichi_mrf.datasets.{place}")
 
 
 FORMATS: tuple[Format, ...] = (

@@ -7,7 +7,8 @@ What tells that a source is one is here; the readers are imported when such a so
 from pathlib import Path
 
 from taichi_mrf.config.files import read_yaml
-from taichi_mrf.datasets.base import Format, reader
+from taichi_mrf.datasets.base import Format
+from taichi_mrf.datasets.entries import reader
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.files import is_file, is_folder
 

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from taichi_mrf.datasets.base import reader
+from taichi_mrf.datasets.entries import reader
 from taichi_mrf.datasets.intrinsics import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
 from taichi_mrf.datasets.ros.names import METADATA, is_bag
