@@ -84,12 +84,12 @@ _LONGEST = 200
 @contextmanager
 def naming(where: object, *kinds: type[Exception]) -> Iterator[None]:
     """Raise what the block raises of some ``kinds``, DatasetError by default, as a DatasetError that begins
-    with ``where``: what reads a part of a file need not know its name."""
+    with ``where``, if it is not empty: what reads a part of a file need not know its name."""
     caught = kinds or (DatasetError,)
     try:
         yield
     except caught as error:
-        raise DatasetError(f"{where}: {error}") from error
+        raise DatasetError(f"{where}: {error}" if where else str(error)) from error
 
 
 @contextmanager

@@ -41,8 +41,7 @@ def when_called(place: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of recording in a folder or a file: its entry in the list (entries.py), or a plug
-    (registry.py)."""
+    """A kind of recording in a folder or a file: an entry (entries.py), or a plug (registry.py)."""
 
     name: str
 
@@ -96,8 +95,7 @@ class StatedSensor:
 @dataclass(frozen=True)
 class Arrivals:
     """How the frames of a sensor that runs come: ``rate_hz``, and how old that which was read last is by now,
-    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since it was
-    opened."""
+    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since."""
 
     rate_hz: float
     age_s: float | None
@@ -164,8 +162,7 @@ class Dataset(ABC):
 
     @property
     def stated(self) -> StatedSensor:
-        """Properties of the sensor that the recording states: here a sigma that the confidence is relative
-        to."""
+        """Facts of the sensor that the recording states: here a sigma that the confidence is relative to."""
         if self.confidence is None:
             return StatedSensor()
         return StatedSensor(self.confidence.sigma, True, self.confidence.origin)
@@ -229,11 +226,9 @@ class Dataset(ABC):
 
 @dataclass(frozen=True)
 class Row:
-    """One frame in a :class:`Table`; a format adds where its images are.
-
-    ``pose`` is T_world_camera, (4, 4), or reads it: that raises DatasetError, which names the file, or
-    KeyframeError for an invalid pose; ``pose_source`` then names the file, or the file and the line.
-    """
+    """One frame in a :class:`Table`; a format adds where its images are. ``pose`` is T_world_camera, (4, 4),
+    or reads it: that raises DatasetError, which names the file, or KeyframeError for an invalid pose;
+    ``pose_source`` then names the file, or the file and the line."""
 
     name: str
     stamp: float
@@ -260,7 +255,6 @@ class Table(Dataset, Generic[AnyRow]):
     """Reads the poses with stamps of their own; None if there are only those of rows."""
 
     def own_poses(self) -> StampedPoses | None:
-        """Those of ``track``."""
         return None if self.track is None else self.track()
 
     @abstractmethod
@@ -269,16 +263,13 @@ class Table(Dataset, Generic[AnyRow]):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """The names of the rows."""
         return [row.name for row in self.rows]
 
     def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
         return [row.stamp for row in self.rows]
 
     def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises FrameError, which names the frame and the file; IndexError outside 0
-        to len - 1."""
+        """Raises FrameError, which names the frame and the file; IndexError outside 0 to len - 1."""
         row = self._row(index)
         try:
             return row.pose() if callable(row.pose) else row.pose

@@ -15,8 +15,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
 _CELL = 2
-"""Side in colour pixels of the cells in which the nearest point is kept: small holes between points are
-closed."""
+"""Side in colour pixels of the cells in which the nearest point is kept, which closes small holes."""
 
 _BEHIND = 0.03
 """A point that is further away than the nearest in its cell by more than this share is hidden."""
@@ -27,8 +26,7 @@ _NOWHERE = np.float32(-100.0)
 
 @dataclass(frozen=True, eq=False)
 class ColorCamera:
-    """A colour camera beside a depth camera: ``T_color_depth`` (4, 4) takes points of the depth camera to
-    it."""
+    """A colour camera: ``T_color_depth`` (4, 4) takes points of the depth camera beside it to it."""
 
     camera: PinholeCamera
     T_color_depth: Pose
@@ -71,5 +69,4 @@ def without_black(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
 @lru_cache(maxsize=8)
 def _turned_rays(depth_camera: PinholeCamera, to: ColorCamera) -> NDArray[np.float32]:
     """The depth camera's rays in the colour camera's axes, (3, H, W)."""
-    turned: NDArray[np.float64] = np.einsum("ij,hwj->ihw", to.T_color_depth[:3, :3], depth_camera.rays())
-    return turned.astype(np.float32)
+    return np.einsum("ij,hwj->ihw", to.T_color_depth[:3, :3], depth_camera.rays()).astype(np.float32)

@@ -98,7 +98,7 @@ class Evidence:
 
 
 def check_metres(depths: Sequence[Image], where: str) -> None:
-    """Raise DatasetError, whose text begins with ``where``, if floats (H, W) are no plausible metres."""
+    """Raise DatasetError, which begins with ``where``, if floats (H, W) are no plausible metres."""
     values = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths] or [np.zeros(0)])
     median = float(np.median(values)) if len(values) else 0.0
     if median > _NO_METRES:
@@ -138,11 +138,9 @@ def gather(
     camera: PinholeCamera,
     candidates: Sequence[float],
 ) -> Evidence:
-    """Compare neighbouring frames at a few places of a recording.
-
-    ``read_steps`` gives the raw depth image (H, W) of a frame, 0 where there is no measurement. Frames that
-    cannot be read (DatasetError, KeyframeError) are passed over.
-    """
+    """Compare neighbouring frames at a few places of a recording. ``read_steps`` gives the raw depth image
+    (H, W) of a frame, 0 where there is no measurement. Frames that cannot be read (DatasetError,
+    KeyframeError) are passed over."""
     medians, differences = [], []
     for first in np.unique(np.linspace(0, frames - 1, _PLACES + 1).astype(int)[:-1] if frames else []):
         try:

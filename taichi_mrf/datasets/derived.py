@@ -11,6 +11,7 @@ This is done on frames, so that it is the same for all formats.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -31,56 +32,46 @@ from taichi_mrf.sensor.frame import Frame
 
 @dataclass
 class Derived(Dataset):
-    """As many frames as ``source`` has, with the same names; subclasses define how a frame is read."""
+    """As many frames as ``source`` has, with the same names, and all else as the source has it; subclasses
+    define how a frame is read."""
 
     source: Dataset = field(kw_only=True)
 
     @property
     def endless(self) -> bool:
-        """True if the source is."""
         return self.source.endless
 
     def awaiting(self) -> str:
-        """What the source waits for."""
         return self.source.awaiting()
 
     def arrivals(self) -> Arrivals | None:
-        """The source's."""
         return self.source.arrivals()
 
     @property
     def stated(self) -> StatedSensor:
-        """The source's."""
         return self.source.stated
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
-        """The source's."""
         return self.source.origin_m
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
-        """The source's."""
         return self.source.stamps()
 
     def pose(self, index: int) -> Pose:
-        """The source's."""
         return self.source.pose(index)
 
     def own_poses(self) -> StampedPoses | None:
-        """The source's."""
         return self.source.own_poses()
 
     def misfit(self) -> str | None:
-        """The source's."""
         return self.source.misfit()
 
     def sensor_of(self, index: int) -> str:
-        """The source's."""
         return self.source.sensor_of(index)
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """The source's."""
         return self.source.frame_names
 
 
@@ -125,30 +116,25 @@ def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
 
 @dataclass
 class Chosen(Derived):
-    """Some frames of ``source``: those with the ``indices``."""
+    """Some frames of ``source``, and what it has of these: those with the ``indices``."""
 
     indices: Sequence[int] = field(kw_only=True)
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """Those of the chosen frames."""
         return [self.source.frame_names[index] for index in self.indices]
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
-        """Those of the chosen frames."""
         stamps = self.source.stamps()
         return [float(stamps[index]) for index in self.indices]
 
     def pose(self, index: int) -> Pose:
-        """The source's of that frame."""
         return self.source.pose(self.indices[index])
 
     def sensor_of(self, index: int) -> str:
-        """The source's of that frame."""
         return self.source.sensor_of(self.indices[index])
 
     def read(self, index: int) -> Frame:
-        """The source's frame. Raises what the source raises."""
         return self.source.read(self.indices[index])
 
 
@@ -159,12 +145,10 @@ def chosen(dataset: Dataset, indices: Sequence[int]) -> Chosen:
 
 @dataclass
 class Resampled(Derived):
-    """The frames of ``source``, each pixel of them picked from the recorded image.
-
-    ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
-    did not meet the recorded image, which is no measurement. Recorded images are ``turned`` (conventions.py).
-    One in ``stride`` pixels is kept; if they are not ``distorted``, frames may have cameras of their own.
-    """
+    """The frames of ``source``, each pixel of them picked from the recorded image. ``rows`` and ``columns``
+    (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray did not meet the
+    recorded image, which is no measurement. Recorded images are ``turned`` (conventions.py). One in
+    ``stride`` pixels is kept; if they are not ``distorted``, frames may have cameras of their own."""
 
     rows: NDArray[np.int64] = field(kw_only=True)
     columns: NDArray[np.int64] = field(kw_only=True)
@@ -208,12 +192,9 @@ class Resampled(Derived):
 
 def resampled(dataset: Dataset, distortion: Sequence[float], stride: int, turned: str = "") -> Dataset:
     """The dataset with its images put back where they are ``turned`` (conventions.py), undistorted, and one
-    in ``stride`` of their rows and columns kept.
-
-    ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
-    camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
-    left of an image, and if its camera is no pinhole.
-    """
+    in ``stride`` of their rows and columns kept. ``distortion`` are OpenCV's coefficients of the recorded
+    images (none or zeros: they are a pinhole camera's). The camera keeps its intrinsics but for the stride.
+    Raises DatasetError if nothing would be left of an image, and if its camera is no pinhole."""
     distorted = any(distortion)
     if not (distorted or turned) and stride == 1:
         return dataset
@@ -257,11 +238,9 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int, turned
 
 
 def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[int, int]]:
-    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept.
-
-    Its rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
-    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left.
-    """
+    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept. Its
+    rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
+    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left."""
     first = (stride - 1) // 2
     thin = PinholeCamera(
         width=len(range(first, camera.width, stride)),
@@ -374,7 +353,6 @@ class Mended(Derived):
         return self.source.origin_m + self.moved_m
 
     def pose(self, index: int) -> Pose:
-        """The pose of one frame. Raises what the source raises."""
         if self.timed is None:
             T = pose_of(self.source.pose(index), self.conventions)
         else:
@@ -388,7 +366,6 @@ class Mended(Derived):
         return T
 
     def read(self, index: int) -> Frame:
-        """The source's frame. Raises what the source raises."""
         frame = self.source.read(index)
         depth_m = axial_depth(frame.depth_m, frame.camera, self.conventions)
         T = pose_of(frame.T_world_camera, self.conventions)
@@ -432,10 +409,8 @@ def mended(dataset: Dataset, conventions: Conventions, max_time_gap: float | Non
 def _first_pose(dataset: Dataset, conventions: Conventions) -> Pose | None:
     """The pose of the first frame that has one."""
     for index in range(len(dataset)):
-        try:
+        with suppress(FrameError):
             return pose_of(dataset.pose(index), conventions)
-        except FrameError:
-            continue
     return None
 
 
@@ -470,9 +445,7 @@ def _of_frames(dataset: Dataset, stamps: NDArray[np.float64]) -> StampedPoses:
     known: list[int] = []
     poses: list[Pose] = []
     for index in range(len(dataset)):
-        try:
+        with suppress(FrameError):
             poses.append(dataset.pose(index))
             known.append(index)
-        except FrameError:
-            continue
     return stamps[known], poses

@@ -9,14 +9,12 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 from taichi_mrf.datasets.base import BuiltIn, Format, when_called
 from taichi_mrf.datasets.ros.names import METADATA, SUFFIXES, is_bag
 from taichi_mrf.system.files import is_file, is_folder
 
-HERE = "taichi_mrf.datasets"
 REALSENSE = "realsense:"
 FOXGLOVE, ZENOH = ROBOTS = "foxglove:", "zenoh:"
 NUMBERED_IMAGE = re.compile(
@@ -105,12 +103,12 @@ def _is_scan_folder(path: Path) -> bool:
         return path.suffix.lower() == ".pcd"
     places = (path / place for place in CLOUD_PLACES)
     may_be = any(c.suffix.lower() in CLOUDS for place in places if is_folder(place) for c in place.iterdir())
-    return may_be and resolve_name(f"{HERE}.lidar.scan_folder:recognises")(path)
+    return may_be and reader("lidar.scan_folder:recognises")(path)
 
 
 def reader(place: str) -> Callable[..., Any]:
     """Opener of a source, "module:function" in this package, which is imported when it is called."""
-    return when_called(f"{HERE}.{place}")
+    return when_called(f"taichi_mrf.datasets.{place}")
 
 
 FORMATS: tuple[Format, ...] = (
@@ -141,9 +139,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         "nerfstudio",
         "transforms.json with depth_file_path",
-        lambda path: (
-            _has("transforms.json")(path) and resolve_name(f"{HERE}.formats.nerfstudio:recognises")(path)
-        ),
+        lambda path: _has("transforms.json")(path) and reader("formats.nerfstudio:recognises")(path),
         reader("formats.nerfstudio:open_folder"),
     ),
     Format(

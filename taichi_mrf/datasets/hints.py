@@ -29,7 +29,6 @@ LIDAR_POSES = (
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info", ".json")
 
-
 AS_NPZ = (
     "write them as an .npz with depth_m (N, H, W) in metres, T_world_camera (N, 4, 4) and K (3, 3), or as "
     "16-bit PNGs NNNN.png with camera.txt (width height fx fy cx cy) and poses.txt (for each image the 12 "
@@ -112,11 +111,11 @@ def hint_for(path: Path) -> str | None:
         names = ", ".join(child.name for child in scans[:8])
         return f"contains 2D laser scans; pass one of {names} to taichi-mrf laser"
     kinds = [kind for child in children if (kind := _kind(child))]
-    below = [file for child in sorted(path.iterdir()) if is_folder(child) for file in _first_files(child)]
-    images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
-    unread = [
-        file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in (".exr", ".npy", ".pfm")
-    ]
+    looked_at = children[:_LOOKED_AT]
+    for folder in filter(is_folder, sorted(path.iterdir())):
+        looked_at += [file for file in sorted(folder.iterdir()) if is_file(file)][:_LOOKED_AT]
+    images = [file for file in looked_at if file.suffix.lower() in _IMAGES]
+    unread = [file for file in looked_at if file.suffix.lower() in (".exr", ".npy", ".pfm")]
     most = kinds[0] if len(set(kinds)) == 1 and 2 * len(kinds) >= len(children) else None
     if most and not ((images or unread) and _POSES_ONLY in most):
         return most
@@ -137,10 +136,6 @@ def image_hint(images: Sequence[Path], what: str) -> str:
         f"{what} of depth ({depth.name}) in a layout that is not read: a recording is a folder with all of "
         f"them, their poses and their camera; {AS_NPZ}"
     )
-
-
-def _first_files(folder: Path) -> list[Path]:
-    return [child for child in sorted(folder.iterdir()) if is_file(child)][:_LOOKED_AT]
 
 
 def _kind(path: Path) -> str | None:

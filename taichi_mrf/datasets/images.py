@@ -12,6 +12,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -34,10 +35,8 @@ Size = tuple[int, int]
 
 
 def claimed_size(data: bytes) -> Size | None:
-    """(width, height) in pixels by the header of an encoded image.
-
-    None for a damaged header and for other formats than those of KNOWN.
-    """
+    """(width, height) in pixels by the header of an encoded image. None for a damaged header and for other
+    formats than those of KNOWN."""
     read = next((read for signature, read in _READERS if re.match(signature, data, re.DOTALL)), None)
     try:
         size = None if read is None else read(data)
@@ -142,7 +141,6 @@ _TIFF_KINDS = {3: "H", 4: "I"}
 _LARGEST_TILE = 1 << 20
 """Pixels of a tile that is larger than its image; small images have tiles of 256 x 256."""
 
-
 ARRAY = ".npy"
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 """Of depth images that folders may hold."""
@@ -160,11 +158,8 @@ def read_depth(
     path: Path, steps_per_metre: float, camera: PinholeCamera | None = None
 ) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, from a grey image of 16 bits or of floats, or from NumPy's array
-    of any numbers (.npy), 0 for none.
-
-    Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
-    of another size than the camera's.
-    """
+    of any numbers (.npy), 0 for none. Raises DatasetError, which names the file, for an image that is
+    missing, damaged, of another kind, or of another size than the camera's."""
     steps = _values(path, camera)
     if path.suffix == ARRAY and steps.dtype.kind in "ui":
         steps = measured(steps)
@@ -233,20 +228,20 @@ def without_filling(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def read_color(path: Path, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
-    """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file, also for one of another
-    size than the camera's."""
+    """An (H, W, 3) uint8 RGB image. Raises DatasetError, which names the file, also for one of another size
+    than the camera's."""
     return decode_color(_image_file(path), str(path), camera)
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """An (H, W) uint8 grey image. Raises DatasetError, whose text names the file."""
+    """An (H, W) uint8 grey image. Raises DatasetError, which names the file."""
     return _decode(_image_file(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def read_levels(path: Path, channels: int, camera: PinholeCamera) -> NDArray[np.uint8]:
     """The numbers of an image's pixels, (H, W) uint8, of several channels (H, W, channels) with red first.
-    Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
-    of another size than the camera's."""
+    Raises DatasetError, which names the file, for an image that is missing, damaged, of another kind, or of
+    another size than the camera's."""
     image = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
     if image.dtype != np.uint8 or image.size != channels * image.shape[0] * image.shape[1]:
         wanted = _kind(np.empty((1, 1, channels), np.uint8))
@@ -263,18 +258,16 @@ def _kind(image: NDArray) -> str:
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read; a broken one is reported with its frame."""
     for path in paths:
-        try:
+        with suppress(DatasetError):
             height, width = _values(path).shape[:2]
             return width, height
-        except DatasetError:
-            continue
     return None
 
 
 def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint16]:
     """Depth in steps, (H, W) uint16, of an encoded image, 0 where there is no measurement. Raises
-    DatasetError, whose text begins with ``where``, if it is damaged, no 16-bit grey image, or of another size
-    than the camera's."""
+    DatasetError, which begins with ``where``, if it is damaged, no 16-bit grey image, or of another size than
+    the camera's."""
     return _of_16_bit(_decode(data, where, cv2.IMREAD_UNCHANGED, camera), where)
 
 
@@ -296,14 +289,14 @@ def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
 
 
 def decode_unchanged(data: bytes, where: str) -> NDArray:
-    """The values of an encoded image with all its channels, as OpenCV orders them. Raises DatasetError, whose
-    text begins with ``where``, if it is damaged."""
+    """The values of an encoded image with all its channels, as OpenCV orders them. Raises DatasetError, which
+    begins with ``where``, if it is damaged."""
     return _decode(data, where, cv2.IMREAD_UNCHANGED)
 
 
 def decode_color(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
-    """An (H, W, 3) uint8 RGB image from an encoded one. Raises DatasetError, whose text begins with
-    ``where``, if it is damaged, or of another size than the camera's."""
+    """An (H, W, 3) uint8 RGB image from an encoded one. Raises DatasetError, which begins with ``where``, if
+    it is damaged, or of another size than the camera's."""
     return cv2.cvtColor(_decode(data, where, cv2.IMREAD_COLOR, camera), cv2.COLOR_BGR2RGB)
 
 
@@ -378,12 +371,9 @@ def at_size(camera: PinholeCamera, width: int, height: int) -> str:
 
 def _png_damage(data: bytes, kept: list[bytes]) -> str | None:
     """The damage of a PNG's chunks, or None. They are put into ``kept``, all but texts and colour profiles,
-    which libpng unpacks however large they are.
-
-    Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
-    out the upper part of a cut image with zeros below, which would pass for missing depth. For what is
-    packed, the memory that the header claims is not taken before it is known to be filled.
-    """
+    which libpng unpacks however large they are. Checked here since libpng writes to stderr past every logger,
+    and since some builds of OpenCV hand out the upper part of a cut image with zeros below, which would pass
+    for missing depth. Memory that the header claims is not taken before it is known to be filled."""
     position, packed = len(PNG_SIGNATURE), []
     kept.append(PNG_SIGNATURE)
     while position + _CHUNK_BYTES <= len(data):

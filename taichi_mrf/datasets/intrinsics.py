@@ -50,17 +50,11 @@ SCENE_FILE = "camera-intrinsics.txt"
 
 
 def find_camera(
-    folder: Path,
-    options: ReadOptions,
-    default: PinholeCamera,
-    default_name: str,
-    depth_files: Iterable[Path],
+    folder: Path, options: ReadOptions, default: PinholeCamera, default_name: str, depth_files: Iterable[Path]
 ) -> tuple[PinholeCamera, list[str]]:
     """The camera of the recording in ``folder``, and a note where it was assumed and not read.
-
-    ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError,
-    whose text names the file, for an intrinsics file that is not valid.
-    """
+    ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError, which names
+    the file, for an intrinsics file that is not valid."""
     if options.camera is not None:
         return options.camera, []
     if options.intrinsics is not None:
@@ -99,10 +93,8 @@ def own_cameras(
 
 def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
     """The camera in a file: ``width height fx fy cx cy``, ``fx fy cx cy``, a 3 x 3, 3 x 4 or 4 x 4 matrix,
-    lines of ``fx: 525.0``, or YAML or JSON by the file's suffix.
-
-    ``default`` gives the image size where neither the file nor ``depth_files`` do. Raises DatasetError, whose
-    text names the file."""
+    lines of ``fx: 525.0``, or YAML or JSON by the file's suffix. ``default`` gives the image size where
+    neither the file nor ``depth_files`` do. Raises DatasetError, which names the file."""
     if path.suffix == ".json":
         return read_intrinsics(path)
     try:
@@ -124,7 +116,8 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
             try:
                 camera = PinholeCamera.from_matrix(*_image_size(default, depth_files), K)
             except ConfigError as error:
-                raise ConfigError(f"line {_line_of_numbers(text)}: {error}") from error
+                first = next(n for n, line in enumerate(text.splitlines(), start=1) if _words(line))
+                raise ConfigError(f"line {first}: {error}") from error
             return of_this_size(camera)
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
@@ -161,11 +154,6 @@ def of_this_size(camera: PinholeCamera) -> PinholeCamera:
 def _words(line: str) -> list[str]:
     """The numbers of a line as text, without comment, brackets and separators."""
     return re.sub(r"[\[\],;]", " ", line.split("#")[0]).split()
-
-
-def _line_of_numbers(text: str) -> int:
-    """The number, from 1, of the first line with numbers."""
-    return next(number for number, line in enumerate(text.splitlines(), start=1) if _words(line))
 
 
 def _camera_from_names(
@@ -211,7 +199,7 @@ _LISTS = {"PinholeCameraTrajectory": "parameters", "PoseGraph": "nodes"}
 
 
 def read_intrinsics(path: Path) -> PinholeCamera:
-    """The camera of a PinholeCameraIntrinsic file. Raises DatasetError, whose text names the file."""
+    """The camera of a PinholeCameraIntrinsic file. Raises DatasetError, which names the file."""
     return _json_camera(path, _json_values(path))
 
 
@@ -224,11 +212,8 @@ def is_trajectory_json(path: Path) -> bool:
 
 
 def read_trajectory_json(path: Path) -> Trajectory:
-    """The poses of a trajectory, counted from 0, with the cameras of their images where it holds some.
-
-    Raises DatasetError, whose text names the file and the entry, if a matrix is missing or has not 16
-    numbers, or if there is no entry.
-    """
+    """The poses of a trajectory, counted from 0, with the cameras of their images where it holds some. Raises
+    DatasetError, which names the file and the entry, if there is none, or a matrix has not 16 numbers."""
     values = _json_values(path)
     entries = values.get(_LISTS[values["class_name"]])
     if not isinstance(entries, list) or not entries:
@@ -275,8 +260,12 @@ def _json_camera(path: Path | str, values: Any) -> PinholeCamera:
 
 
 def _json_values(path: Path) -> Any:
-    text = read_text(path, DatasetError)
+    return json_values(read_text(path, DatasetError), path)
+
+
+def json_values(text: str | bytes, where: str | Path) -> Any:
+    """The content of a JSON file. Raises DatasetError, which begins with ``where``."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not valid JSON: {said(error)}") from error
+        raise DatasetError(f"{where}: not valid JSON: {said(error)}") from error

@@ -8,7 +8,7 @@ from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import check_field, from_dict
 from taichi_mrf.datasets.conventions import AXIAL, Conventions, conventions_of
 from taichi_mrf.datasets.own_body import NO_BODY, OwnBody
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 DISTORTION_COUNTS = (4, 5, 8)
@@ -69,10 +69,8 @@ class ReadOptions:
     """The robot's own body, whose measurements are left out."""
 
     def __post_init__(self) -> None:
-        try:
+        with naming("", ConfigError):
             self.conventions  # noqa: B018 (it checks its words)
-        except ConfigError as error:
-            raise DatasetError(str(error)) from error
         scale = self.depth_scale
         if scale is not None and not (math.isfinite(scale) and scale > 0):
             raise DatasetError(f"depth_scale must be a positive number of steps per metre, not {scale}")
@@ -82,10 +80,8 @@ class ReadOptions:
         if self.camera is not None and self.intrinsics is not None:
             raise DatasetError("camera and intrinsics both set the intrinsics; pass only one of them")
         if self.intrinsics is not None:
-            try:
+            with naming("", ConfigError):
                 PinholeCamera(1, 1, *self.intrinsics)
-            except ConfigError as error:
-                raise DatasetError(str(error)) from error
         if self.undistort is not None:
             count, finite = len(self.undistort), all(map(math.isfinite, self.undistort))
             if count not in DISTORTION_COUNTS or not finite:
@@ -119,12 +115,10 @@ def require(options: object, **bounds: float | tuple[float, float]) -> None:
 
 
 def parse_options(cls: type[T], query: str, source: str) -> T:
-    """Parse ``name=value&name=value`` into a dataclass, whose fields are the options.
-
-    A field of type str takes its text unchanged, such as a path. Raises DatasetError, whose text names
-    the source, for an option that does not exist (naming the nearest), a value of the wrong type or out of
-    range, and for text that is not of the form name=value.
-    """
+    """Parse ``name=value&name=value`` into a dataclass, whose fields are the options. A field of type str
+    takes its text unchanged, such as a path. Raises DatasetError, which names the source, for an option that
+    does not exist (naming the nearest), a value of the wrong type or out of range, and for text that is not
+    of the form name=value."""
     texts = {field for field, hint in get_type_hints(cls).items() if hint is str}
     values = {}
     for option in query.split("&") if query else ():
@@ -135,7 +129,5 @@ def parse_options(cls: type[T], query: str, source: str) -> T:
             equals = ""
         if not (name and equals):
             raise DatasetError(f"{source}?{query}: options are written name=value, with & between them")
-    try:
+    with naming("", ConfigError):
         return from_dict(cls, values, source)
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error

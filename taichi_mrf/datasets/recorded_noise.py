@@ -52,11 +52,9 @@ LOOKED_AT = 3
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
     """The parameters with the recording's own origin, sigma, reach, ``pass_through``, density of outliers and
-    voxel size in place of the defaults; adds notes to the dataset.
-
-    What the user has set stays, and a sigma or sigma table that is set is that of all pixels. Raises
-    ConfigError if a voxel is larger than half the median depth.
-    """
+    voxel size in place of the defaults; adds notes to the dataset. What the user has set stays, and a sigma
+    or sigma table that is set is that of all pixels. Raises ConfigError if a voxel is larger than half the
+    median depth."""
     depths_m = some_depths(dataset)
     settings = _with_reach(_with_sigma(_with_origin(settings, dataset), dataset), dataset, depths_m)
     settings = _with_floor(_with_pass_through(settings, dataset), dataset, depths_m)

@@ -3,6 +3,7 @@
 A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
@@ -126,11 +127,9 @@ class Recording(Table[RecordedFrame]):
         return self.color_camera.registered(color, depth_m, camera)
 
     def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
-        """Compare neighbouring frames at their poses, and note which scale is used and why.
-
-        A scale of the format is replaced by a usual one with which neighbouring frames agree clearly better;
-        one that a file or the caller gives is kept, and a note says that another would agree better.
-        """
+        """Compare neighbouring frames at their poses, and note which scale is used and why. A scale of the
+        format is replaced by a usual one with which neighbouring frames agree clearly better; one that a file
+        or the caller gives is kept, and a note says that another would agree better."""
         apart = max(1, len(self.rows) // _LOOKED_AT)
         looked = [
             look_at_depth(frame.depth_file, frame.camera or self.camera)
@@ -219,9 +218,20 @@ def first_file(candidates: Iterable[Path]) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
+def natural(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """A key that orders names by the numbers in them: scan-9 before scan-10."""
+    words = re.split(r"(\d+)", path.stem)
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words], path.name
+
+
+def number_in(name: str) -> int | None:
+    """The last number in a name, None if there is none."""
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else None
+
+
 def beside(folder: Path, name: str) -> Path:
-    """A file that a list in a folder names; with a path of another computer that with the same end, if it is
-    there."""
+    """A file that a list in a folder names; of a path of another computer that with the same end, if any."""
     path = folder / name
     try:
         parts = PureWindowsPath(name).parts
@@ -233,8 +243,7 @@ def beside(folder: Path, name: str) -> Path:
 
 
 def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:
-    """A registered colour image with the depth image's pixels. Raises DatasetError if it is not the same
-    view."""
+    """A registered colour image with the depth image's pixels. Raises DatasetError for another view."""
     (height, width), (rows, columns) = camera.shape, color.shape[:2]
     if (rows, columns) == (height, width):
         return color
@@ -243,10 +252,7 @@ def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDA
             f"{path}: the colour image has {columns} x {rows} pixels, depth {width} x {height}, which is not "
             "the same view; without --color only depth is read"
         )
-    scaled: NDArray[np.uint8] = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA).astype(
-        np.uint8
-    )
-    return scaled
+    return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 def _evidence(found: Evidence, steps_per_metre: float) -> str:

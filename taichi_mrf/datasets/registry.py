@@ -109,11 +109,9 @@ def open_dataset(
     image_is: str | None = None,
     body: OwnBody = NO_BODY,
 ) -> Dataset:
-    """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
-
-    The keywords are the fields of :class:`ReadOptions`. Warnings of this package become notes. Raises
-    DatasetError, which names the source and the formats that were looked for.
-    """
+    """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``. The
+    keywords are the fields of :class:`ReadOptions`. Warnings of this package become notes. Raises
+    DatasetError, which names the source and the formats that were looked for."""
     options = ReadOptions(
         camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track,
         poses_are, mounting, depth_is, image_is, body,

@@ -20,7 +20,7 @@ from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.derived import axial_depth
 from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError, said
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, naming, said
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import is_file, read_text
@@ -29,8 +29,7 @@ from taichi_mrf.system.libraries import library
 Floats = NDArray[np.float64]
 
 _FLAT, _ROUND = 1e-3, math.radians(60)
-"""Angles between the normals of two triangles: below the first they are one plane, above the second the edge
-between them is sharp."""
+"""Angles between the normals of two triangles: below the first they are one plane, above the second sharp."""
 
 _STEP = math.radians(30)
 """Round sides of what is grown have corners so far apart."""
@@ -63,10 +62,8 @@ def read_joints(path: Path) -> Joints:
     """Positions from a YAML file, ``name: value``, or a CSV table with the columns stamp and a joint each.
     Raises DatasetError, which names the file, and the line of a table."""
     if path.suffix.lower() != ".csv":
-        try:
+        with naming("", ConfigError):
             values = read_yaml(path)
-        except ConfigError as error:
-            raise DatasetError(str(error)) from error
         if not isinstance(values, dict) or not all(isinstance(x, int | float) for x in values.values()):
             raise DatasetError(f"{path}: expected joints as 'name: value', or a .csv of stamp and joints")
         return Joints(tuple(map(str, values)), np.array([list(values.values())], np.float64))
@@ -132,8 +129,7 @@ class RobotModel:
         self.note += f"; around the sensor, and left out: {', '.join(around)}" if around else ""
 
     def _T_camera_part(self, node: str) -> Pose:
-        T: Pose = np.array(self._robot.get_transform(node, self._link), np.float64)
-        return T
+        return np.array(self._robot.get_transform(node, self._link), np.float64)
 
     def covered(self, frame: Frame) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """The pixels (H, W) of a frame whose ray meets the grown body, but for those that measure something

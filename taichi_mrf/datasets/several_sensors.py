@@ -16,8 +16,7 @@ sensors must count from one beginning, at poses in one world. Each frame states 
 """
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -122,11 +121,9 @@ class SeveralSensors(Table[SensorFrame]):
         return StatedSensor(reach_m=max(sensor.range_m[1] for sensor in self.sensors))
 
     def sensor_of(self, index: int) -> str:
-        """The name of the sensor that took a frame."""
         return self.rows[index].taken_by.name
 
     def load(self, index: int, row: SensorFrame, T_world_camera: Pose) -> Frame:
-        """The frame of its sensor."""
         sensor = row.taken_by
         with naming(sensor.name, FrameError):
             frame = sensor.dataset.read(row.index)
@@ -148,10 +145,8 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
     _refuse(path, options)
     if _opening:
         raise DatasetError(f"{path}: lists several sensors, as {_opening[0]} does: list all of them there")
-    try:
+    with naming("", ConfigError):
         described = from_dict(SensorsFile, read_yaml(path), str(path))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
     if not described.sensors:
         raise DatasetError(f"{path}: lists no sensor")
     names = [entry.name or f"sensor-{number}" for number, entry in enumerate(described.sensors, start=1)]
@@ -159,8 +154,12 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
         raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
     sensors, rows = [], []
     for entry, name in zip(described.sensors, names, strict=True):
-        with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError), _opens(path):
-            sensor = _open_sensor(path, entry, name, options)
+        _opening.append(path)
+        try:
+            with naming(f"{path}: {name}", ConfigError, DatasetError, KeyframeError):
+                sensor = _open_sensor(path, entry, name, options)
+        finally:
+            _opening.clear()
         stamps, frame_names = sensor.dataset.stamps(), sensor.dataset.frame_names
         for i in range(0, len(sensor.dataset), entry.every):
             pose = partial(_pose, sensor, i)
@@ -180,15 +179,6 @@ def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
 
 _opening: list[Path] = []
 """The file whose sensors are being opened: one that lists another could name itself, or grow without end."""
-
-
-@contextmanager
-def _opens(path: Path) -> Iterator[None]:
-    _opening.append(path)
-    try:
-        yield
-    finally:
-        _opening.clear()
 
 
 def _pose(sensor: RecordedSensor, index: int) -> Pose:

@@ -73,9 +73,7 @@ class SourceFlags(OwnBody):
             "image_is": self.image_is,
             "body": self.own_body,
         }
-        conventions_of(
-            keywords["poses_are"], keywords["mounting"], keywords["depth_is"], keywords["image_is"]
-        )
+        conventions_of(self.poses_are, keywords["mounting"], self.depth_is, self.image_is)
         return keywords
 
 

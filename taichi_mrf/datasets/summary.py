@@ -72,7 +72,7 @@ def summarise(dataset: Dataset) -> Summary:
         centres.append(frame.T_world_camera[:3, 3])
         stamps.append(frame.stamp)
     problem = problem or dataset.misfit()
-    values = np.concatenate(depths) if depths else np.empty(0)
+    values, places = np.concatenate(depths) if depths else np.empty(0), np.array(centres)
     low_high = np.percentile(values, [1, 99]) if values.size else None
     return Summary(
         frames=None if dataset.endless else count,
@@ -80,11 +80,7 @@ def summarise(dataset: Dataset) -> Summary:
         seconds=float(stamps[-1] - stamps[0]) if len(stamps) > 1 else None,
         depth_range=None if low_high is None else (float(low_high[0]), float(low_high[1])),
         measured=measured / pixels if pixels else None,
-        centre_range=_range(np.array(centres)) if centres else None,
+        centre_range=(tuple(places.min(0).tolist()), tuple(places.max(0).tolist())) if centres else None,
         problem=problem,
         usable=bool(centres),
     )
-
-
-def _range(points: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return tuple(map(float, points.min(axis=0))), tuple(map(float, points.max(axis=0)))

@@ -116,11 +116,9 @@ def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, ga
 
 
 class TimedPoses:
-    """A trajectory that interpolates the pose at any time inside it.
-
-    ``stamps`` (N,) float64 are seconds, ascending; ``poses`` (N, 4, 4) take points of the moving frame to the
-    fixed one. ``restarts`` counts how often the clock of poses that came one by one started again.
-    """
+    """A trajectory that interpolates the pose at any time inside it. ``stamps`` (N,) float64 are seconds,
+    ascending; ``poses`` (N, 4, 4) take points of the moving frame to the fixed one. ``restarts`` counts how
+    often the clock of poses that came one by one started again."""
 
     def __init__(self, stamps: Sequence[float] | NDArray, poses: Sequence[Pose] | NDArray) -> None:
         """Sort the poses by their stamps; of several with one stamp the last one given counts."""
@@ -157,12 +155,9 @@ class TimedPoses:
         return len(self) > 1 and np.allclose(self.poses, self.poses[0], rtol=0, atol=_SAME)
 
     def at(self, stamp: float, largest_gap: float) -> Pose | None:
-        """The pose (4, 4) at a time, or None.
-
-        It is None outside the trajectory, and where the two neighbours in time are more than twice
-        ``largest_gap`` seconds apart: a time midway between them is then further from both. A pose with this
-        very stamp is its own neighbour on both sides.
-        """
+        """The pose (4, 4) at a time, or None. It is None outside the trajectory, and where the two neighbours
+        in time are more than twice ``largest_gap`` seconds apart: a time midway between them is then further
+        from both. A pose with this very stamp is its own neighbour on both sides."""
         after = int(np.searchsorted(self.stamps, stamp))
         # A little wider than the gap, to absorb the rounding of a difference.
         window = 2 * largest_gap + 4 * np.spacing(abs(stamp) + largest_gap)
@@ -225,14 +220,12 @@ def interpolate(
 
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths (...) of vectors (..., n)."""
-    length: NDArray[np.float64] = np.sqrt(_dot(vectors, vectors))
-    return length
+    return np.sqrt(_dot(vectors, vectors))
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Scalar products (...) of vectors (..., n)."""
-    products: NDArray[np.float64] = (a[..., None, :] @ b[..., :, None])[..., 0, 0]
-    return products
+    return (a[..., None, :] @ b[..., :, None])[..., 0, 0]
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -248,17 +241,13 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
             [zy - yz, xz - zx, yx - xy, xx + yy + zz],
         ]
     )
-    vectors: NDArray[np.float64] = np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)))[1]
-    return vectors[..., -1]
+    return np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)))[1][..., -1]
 
 
 def read_timed_poses(path: Path) -> TimedPoses:
-    """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera.
-
-    The lines may come in any order; a blank or a comma separates values. Raises DatasetError, whose text
-    names the file and the line, if it is missing, of another layout, or contains no valid pose; warns of
-    invalid ones, which are left out.
-    """
+    """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera. The lines may come in any
+    order; a blank or a comma separates values. Raises DatasetError, which names the file and the line, if it
+    is missing, of another layout, or contains no valid pose; warns of invalid ones, which are left out."""
     trajectory = read_trajectory(path)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{path}: poses without stamps; expected stamp tx ty tz qx qy qz qw on each line")

@@ -189,6 +189,14 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def floats(words: Iterable[str | bytes | float], where: str) -> list[float]:
+    """The numbers that are words. Raises DatasetError, which begins with ``where``."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise DatasetError(f"{where} contains something that is not a number") from None
+
+
 def _number(word: str) -> float:
     """A number; nanoseconds keep all their digits."""
     return int(word) if word.isascii() and word.isdecimal() else float(word)
@@ -208,12 +216,9 @@ _UNIT_LENGTH = 0.01
 
 @dataclass(frozen=True)
 class RecordedPose:
-    """One pose as it was written.
-
-    ``key`` is its stamp in seconds, or the frame's number where the layout counts frames. ``values``
-    are tx ty tz qx qy qz qw, (7,), or a matrix, (3, 4) or (4, 4). ``source`` is the file and the line.
-    ``camera`` took the frame, where the file holds its intrinsics.
-    """
+    """One pose as it was written. ``key`` is its stamp in seconds, or the frame's number where the layout
+    counts frames. ``values`` are tx ty tz qx qy qz qw, (7,), or a matrix, (3, 4) or (4, 4). ``source`` is the
+    file and the line. ``camera`` took the frame, where the file holds its intrinsics."""
 
     key: float
     values: NDArray[np.float64]
@@ -241,11 +246,9 @@ class Trajectory:
 
 def read_trajectory(path: Path) -> Trajectory:
     """Read a file of poses, recognising its layout by the first line. Warns of stamps that come twice, and of
-    a clock that starts again, of whose runs the longest is read.
-
-    Raises DatasetError, whose text names the file and the line, if it cannot be read, contains no pose,
-    or a line has too few or too many numbers or something that is not a number.
-    """
+    a clock that starts again, of whose runs the longest is read. Raises DatasetError, which names the file
+    and the line, if it cannot be read, contains no pose, or a line has too few or too many numbers or
+    something that is not a number."""
     lines = lines_of_numbers(path)
     if not lines:
         raise DatasetError(f"{path}: contains no pose")
@@ -367,11 +370,8 @@ def is_lost(pose_file: Path) -> bool:
 
 
 def read_matrix_file(path: Path) -> Pose:
-    """The pose in a file of its own, as a 3 x 4 or 4 x 4 matrix.
-
-    Raises DatasetError if the file is missing or holds no such matrix, KeyframeError if that is no
-    rigid transform.
-    """
+    """The pose in a file of its own, as a 3 x 4 or 4 x 4 matrix. Raises DatasetError if the file is missing
+    or holds no such matrix, KeyframeError if that is no rigid transform."""
     if not is_file(path):
         raise DatasetError(f"{path}: the pose is missing")
     numbers = [number for _, row in lines_of_numbers(path) for number in row]
@@ -381,10 +381,8 @@ def read_matrix_file(path: Path) -> Pose:
 
 
 def pose_from_quaternion(values: NDArray[np.float64]) -> Pose:
-    """tx ty tz qx qy qz qw, (7,), to a (4, 4) matrix; the quaternion is normalised.
-
-    Raises KeyframeError if a value is not finite or the quaternion is zero.
-    """
+    """tx ty tz qx qy qz qw, (7,), to a (4, 4) matrix; the quaternion is normalised. Raises KeyframeError if a
+    value is not finite or the quaternion is zero."""
     if not np.isfinite(values).all():
         raise KeyframeError("a pose contains a value that is not finite (NaN or infinity)")
     norm = np.linalg.norm(values[3:])

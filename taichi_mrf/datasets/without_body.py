@@ -38,8 +38,7 @@ class WithoutBody(Derived):
     covered: Covered = field(kw_only=True)
 
     def read(self, index: int) -> Frame:
-        """Read the source's frame. Raises what the source raises, and FrameError for images of another size
-        than the mask's."""
+        """Raises what the source raises, and FrameError for images of another size than the mask's."""
         frame = self.source.read(index)
         covered, free_m = self.covered(frame)
         no_return = None if frame.no_return is None else frame.no_return * ~covered

@@ -18,12 +18,12 @@ from refusals import refusal, refused
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.lidar.clouds import (
     is_cloud,
-    natural,
     read_cloud,
     read_pcd,
     read_ply_points,
     unpack_lzf,
 )
+from taichi_mrf.datasets.recording import natural
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
 

@@ -14,7 +14,9 @@ from taichi_mrf.cluster.submaps.plan import Job, Plan, SourceFrames, Submap
 from taichi_mrf.cluster.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.datasets.synthetic.corridor import NAME, floor_area_m2
+from taichi_mrf.datasets.synthetic.corridor import HALF_WIDTH, NAME, corridor_length
+from taichi_mrf.datasets.synthetic.room_furniture import LENGTH
+from taichi_mrf.datasets.synthetic.room_furniture import WIDTH as ROOM_WIDTH
 from taichi_mrf.evaluation.experiments.folds import Experiment
 from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
@@ -153,7 +155,7 @@ def _cost(config: Config, result: SubmapsResult, single: OccupancyMap, path: Pat
     seconds = (time.process_time() - begin) / len(m.keyframes)
     size = single.statistics()
     keyframe_bytes = sum(k.voxel_bytes + k.image_bytes for k in m.keyframes.values()) / len(m.keyframes)
-    area = floor_area_m2(ROOMS)
+    area = 2 * HALF_WIDTH * corridor_length(ROOMS) + ROOMS * LENGTH * ROOM_WIDTH  # without walls
     stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     return MeasuredCost(
         voxel_size=config.voxel_size,

@@ -33,8 +33,7 @@ _PIXELS = 20_000
 
 
 def carried_along(search: Search, reading: Reading) -> NDArray[np.bool_] | None:
-    """The pixels (H, W) that show what the camera carries along; None if nothing does, or too few frames
-    tell."""
+    """The pixels (H, W) that show what the camera carries along; None if none do, or too few frames tell."""
     views = {i: v for i, v in search.sample.views.items() if isinstance(v.camera, PinholeCamera)}
     if len(views) < FEWEST_VIEWS or len({view.image.shape for view in views.values()}) > 1:
         return None

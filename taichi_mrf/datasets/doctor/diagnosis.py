@@ -67,10 +67,8 @@ def unexplained(found: Diagnosis) -> Diagnosis:
 
 def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     """Look at some twenty frames, and at the poses around them. ``said`` are conventions that are said of the
-    recording and have not been undone in the dataset.
-
-    Raises DatasetError if the source cannot be read, has no end, or no poses of its own.
-    """
+    recording and have not been undone in the dataset. Raises DatasetError if the source cannot be read, has
+    no end, or no poses of its own."""
     if dataset.endless or dataset.tracked:
         what = "never ends" if dataset.endless else "has no poses that are recorded"
         raise DatasetError(
@@ -108,7 +106,8 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     best = search.best()
     before = search.score(given)
     off = search.differences(given)
-    if len(off) >= FEWEST_PAIRS and _same_poses(sample) and off.mean() > _CONTRADICTING:
+    stands = len(sample.poses) > 0 and np.allclose(sample.poses, sample.poses[0], rtol=0, atol=1e-6)
+    if len(off) >= FEWEST_PAIRS and stands and off.mean() > _CONTRADICTING:
         text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
         return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
     carried = _carried(search, best)
@@ -261,11 +260,6 @@ def _with_likeliest_units(best: Reading, given: Reading, steps: float, sample: S
 def _unit_of_depth(steps: float) -> str:
     """Whose depth has so many steps per metre, empty if nobody's."""
     return next((name for each, name in UNITS.items() if math.isclose(each, steps, rel_tol=1e-6)), "")
-
-
-def _same_poses(sample: Sample) -> bool:
-    """True if the poses say that the sensor does not move."""
-    return len(sample.poses) > 0 and np.allclose(sample.poses, sample.poses[0], rtol=0, atol=1e-6)
 
 
 def _steps(sample: Sample) -> float:

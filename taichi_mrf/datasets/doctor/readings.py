@@ -24,11 +24,7 @@ UNITS = {
 
 def _resized(factor: float) -> Callable[[PinholeCamera], PinholeCamera]:
     return lambda k: replace(
-        k,
-        fx=k.fx * factor,
-        fy=k.fy * factor,
-        cx=(k.cx + 0.5) * factor - 0.5,
-        cy=(k.cy + 0.5) * factor - 0.5,
+        k, fx=k.fx * factor, fy=k.fy * factor, cx=(k.cx + 0.5) * factor - 0.5, cy=(k.cy + 0.5) * factor - 0.5
     )
 
 

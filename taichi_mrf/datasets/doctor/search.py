@@ -180,8 +180,7 @@ class Search:
         return float(np.median(shares)) if len(shares) >= FEWEST_PAIRS else 0.0
 
     def clearly_better(self, one: Reading, other: Reading) -> bool:
-        """True if frames explain each other with the one, and differ by more than twice as much with the
-        other."""
+        """True if frames explain each other with the one, and differ over twice as much with the other."""
         best = self.score(one)
         return best <= EXPLAINED and _BETTER * (best + _NOISE) < self.score(other) + _NOISE
 

@@ -37,8 +37,7 @@ _SAMPLES = 250
 
 @dataclass(frozen=True)
 class Sphere:
-    """The directions around a scanner as an image of ``rows`` rows, and twice as many columns, of equal
-    angles; depth is range."""
+    """The directions around a scanner as an image of ``rows`` and twice as many columns; depth is range."""
 
     rows: int
 

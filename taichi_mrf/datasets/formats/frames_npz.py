@@ -9,7 +9,6 @@ before. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be le
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -30,6 +29,7 @@ from taichi_mrf.system.files import is_folder
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
+WANTED = "an npz file that can be read"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,6 @@ class FramesNpz(Table[NpzFrame]):
         return note_of_largest([share_of_largest(image) for image in depth[:: max(1, len(depth) // 4)]])
 
     def load(self, index: int, row: NpzFrame, T_world_camera: Pose) -> Frame:
-        """One frame of its file's arrays."""
         (depth, color), part, i = self._images(row.part), row.part, row.number
         values = measured(depth[i]) if depth.dtype.kind == "u" else depth[i]
         depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)
@@ -84,7 +83,7 @@ class FramesNpz(Table[NpzFrame]):
 
     def _images(self, part: Part) -> tuple[NDArray, NDArray | None]:
         if self._loaded is None or self._loaded[0] != part.path:
-            with _opened(part.path) as file:
+            with open_npz(part.path, DatasetError, WANTED) as file:
                 count = len(part.poses)
                 depth = _numbers(file, part.path, DEPTH)
                 camera = part.cameras[0] if self.own else self.camera
@@ -102,8 +101,8 @@ class FramesNpz(Table[NpzFrame]):
 
 
 def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
-    """Open one file, or all files of a folder as one sequence. Raises DatasetError, whose text names the file
-    and the field."""
+    """Open one file, or all files of a folder as one sequence. Raises DatasetError, which names the file and
+    the field."""
     paths = sorted(path.glob("*.npz")) if is_folder(path) else [path]
     name = path.name if is_folder(path) else path.stem
     parts: list[Part] = []
@@ -130,7 +129,7 @@ def _rows(part: Part) -> Iterator[NpzFrame]:
 def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
     """One file, whose first frame is number ``first`` of the sequence. Without stamps, frames are a second
     apart."""
-    with _opened(path) as file:
+    with open_npz(path, DatasetError, WANTED) as file:
         shape, dtype = file.header(DEPTH)
         if len(shape) not in (2, 3) or dtype.kind not in "fu":
             raise DatasetError(f"{path}: {DEPTH} is {dtype} {shape}; expected (N, H, W) of floats or uint16")
@@ -138,10 +137,7 @@ def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
         count = shape[0] if len(shape) == 3 else 1
         unposed = options.track and POSE not in file
         poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _numbers(file, path, POSE)
-        if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in (
-            (4, 4),
-            (3, 4),
-        ):
+        if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in ((4, 4), (3, 4)):
             raise DatasetError(f"{path}: {POSE} is {poses.shape}; expected ({count}, 4, 4)")
         stamps = _numbers(file, path, STAMP).reshape(-1) if STAMP in file else first + np.arange(count)
         if stamps.shape != (count,):
@@ -208,7 +204,10 @@ def _steps_per_metre(path: Path, file: NpzFile, dtype: np.dtype, options: ReadOp
     if options.depth_scale is not None:
         return options.depth_scale
     if SCALE in file:
-        scale = _number(file, path, SCALE)
+        found = _numbers(file, path, SCALE)
+        if found.size != 1:
+            raise DatasetError(f"{path}: {SCALE} is {found.shape}; expected one number")
+        scale = float(found.reshape(-1)[0])
         if not 0 < scale < float("inf"):
             raise DatasetError(f"{path}: {SCALE} must be a positive number of steps per metre, not {scale:g}")
         return scale
@@ -217,20 +216,9 @@ def _steps_per_metre(path: Path, file: NpzFile, dtype: np.dtype, options: ReadOp
     return 1.0
 
 
-def _opened(path: Path) -> AbstractContextManager[NpzFile]:
-    return open_npz(path, DatasetError, "an npz file that can be read")
-
-
 def _numbers(file: NpzFile, path: Path, name: str) -> NDArray:
     """An array of integers or floating-point numbers."""
     found = file[name]
     if found.dtype.kind not in "fiu":
         raise DatasetError(f"{path}: {name} is {found.dtype}, not numbers")
     return found
-
-
-def _number(file: NpzFile, path: Path, name: str) -> float:
-    found = _numbers(file, path, name)
-    if found.size != 1:
-        raise DatasetError(f"{path}: {name} is {found.shape}; expected one number")
-    return float(found.reshape(-1)[0])

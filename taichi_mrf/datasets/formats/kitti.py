@@ -31,10 +31,11 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import velodyne_sequence
-from taichi_mrf.datasets.lidar.clouds import layout_notes, natural, number_of, read_cloud
+from taichi_mrf.datasets.lidar.clouds import layout_notes, read_cloud
 from taichi_mrf.datasets.lidar.registered import in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.recording import natural, number_in
 from taichi_mrf.datasets.stereo.matching import (
     RecordedPair,
     StereoPairs,
@@ -43,7 +44,7 @@ from taichi_mrf.datasets.stereo.matching import (
     read_times,
     size_of_pairs,
 )
-from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, read_trajectory
+from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, floats, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -57,7 +58,8 @@ def open_scans(path: Path, options: ReadOptions) -> Dataset:
     """List the scans in the order of their numbers. Raises DatasetError, which names the file and line."""
     folder = velodyne_sequence(path)
     assert folder is not None
-    files = _scans(folder)
+    every = (folder / SCANS).iterdir() if is_folder(folder / SCANS) else ()
+    files = sorted((file for file in every if file.suffix == ".bin" and is_file(file)), key=natural)
     T_camera_lidar = read_calibration(folder / CALIBRATION)
     poses = _poses_of_scans(folder)
     notes, stamps = [], None
@@ -68,7 +70,7 @@ def open_scans(path: Path, options: ReadOptions) -> Dataset:
     by_number = {int(pose.key): pose for pose in poses.poses}
     found: list[tuple[Path, float, RecordedPose]] = []
     for file in files:
-        number = number_of(file)
+        number = number_in(file.stem)
         if number not in by_number or (stamps is not None and number >= len(stamps)):
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
@@ -108,16 +110,11 @@ def read_calibration(path: Path) -> Pose:
     if words is None:
         raise DatasetError(f"{path}: has no line Tr:, the 3 x 4 matrix from the lidar to the camera")
     try:
-        return as_pose(np.array([float(word) for word in words]).reshape(3, 4))
+        matrix = np.array([float(word) for word in words]).reshape(3, 4)
     except ValueError:
         raise DatasetError(f"{path}: Tr must be 12 numbers") from None
-    except KeyframeError as error:
-        raise DatasetError(f"{path}: Tr: {error}") from error
-
-
-def _scans(folder: Path) -> list[Path]:
-    files = (folder / SCANS).iterdir() if is_folder(folder / SCANS) else ()
-    return sorted((file for file in files if file.suffix == ".bin" and is_file(file)), key=natural)
+    with naming(f"{path}: Tr", KeyframeError):
+        return as_pose(matrix)
 
 
 def _poses_of_scans(folder: Path) -> Trajectory:
@@ -148,12 +145,12 @@ _SAME = 1e-6
 
 
 def open_pairs(folder: Path, options: ReadOptions) -> Dataset:
-    """List the pairs in the order of their names. One that lacks an image is listed, and named in an error
-    when it is read."""
+    """List the pairs in the order of their names. One that lacks an image raises an error when it is read."""
     if options.depth_scale is not None:
         raise DatasetError(f"{folder}: takes no depth_scale: depth comes from stereo pairs")
     left, right = next(pair for pair in FOLDERS if all((folder / side).is_dir() for side in pair))
-    names = sorted(_images(folder / left) | _images(folder / right), key=_number)
+    every = _images(folder / left) | _images(folder / right)
+    names = sorted(every, key=lambda name: (int(Path(name).stem), name))
     if not names:
         raise DatasetError(f"{folder}: no numbered images in {left} or {right}")
     rig = _read_rig(folder, left, names, options)
@@ -186,10 +183,6 @@ def _images(folder: Path) -> set[str]:
     return {p.name for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in IMAGE_SUFFIXES}
 
 
-def _number(name: str) -> tuple[int, str]:
-    return int(Path(name).stem), name
-
-
 def _needed(path: Path) -> Path:
     if not path.is_file():
         raise DatasetError(f"{path}: is missing; a stereo recording needs {CALIBRATION} and {POSES}")
@@ -217,11 +210,9 @@ def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
 
 
 def read_rig(path: Path, width: int, height: int) -> StereoRig:
-    """The rig of images of ``width`` x ``height`` pixels.
-
-    Raises DatasetError, whose text names the file, if it cannot be read, lacks P0 or P1, or if these are
-    not two equal pinhole cameras, the first at the origin and the second to its right.
-    """
+    """The rig of images of ``width`` x ``height`` pixels. Raises DatasetError, which names the file, if it
+    cannot be read, lacks P0 or P1, or if these are not two equal pinhole cameras, the first at the origin and
+    the second to its right."""
     P_left, P_right = _read_projections(path)
     K = P_left[:, :3]
     fx = K[0, 0]
@@ -255,10 +246,7 @@ def _projection(path: Path, name: str, rows: dict[str, list[str]]) -> NDArray[np
     words = rows.get(name)
     if words is None:
         raise DatasetError(f"{path}: {name} is missing")
-    try:
-        numbers = np.array([float(word) for word in words])
-    except ValueError:
-        raise DatasetError(f"{path}: {name} contains something that is not a number") from None
+    numbers = np.array(floats(words, f"{path}: {name}"))
     if len(numbers) != 12 or not np.isfinite(numbers).all():
         raise DatasetError(
             f"{path}: {name} must be 12 finite numbers (a 3 x 4 matrix), it has {len(numbers)}"

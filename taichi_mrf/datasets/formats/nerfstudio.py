@@ -9,9 +9,7 @@ missing, floats are metres and whole numbers millimetres. Poses stay where ``app
 them; if it or ``applied_scale`` has scaled them, that is undone.
 """
 
-import json
 import math
-import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -23,11 +21,11 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import T_AXES_OPTICAL
 from taichi_mrf.datasets.images import first_size
-from taichi_mrf.datasets.intrinsics import own_cameras
+from taichi_mrf.datasets.intrinsics import json_values, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, beside, first_file, recording
+from taichi_mrf.datasets.recording import RecordedFrame, beside, first_file, natural, recording
 from taichi_mrf.datasets.turned import of_image_size, turn_hint
-from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, said
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
@@ -61,9 +59,12 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     frames = [(f"{path}: frames[{n}]", frame) for n, frame in enumerate(values["frames"])]
     with_depth = [(where, frame) for where, frame in frames if frame.get("depth_file_path")]
     files = [_file(folder, where, frame["depth_file_path"]) for where, frame in with_depth]
-    order = sorted(range(len(files)), key=lambda place: _in_order(files[place]))
+    order = sorted(range(len(files)), key=lambda place: natural(files[place]))
     color_cameras = [_camera(where, {**values, **frame}) for where, frame in with_depth]
-    lenses = {_lens(where, {**values, **frame}) for where, frame in with_depth}
+    lenses = {
+        tuple(_number(where, name, {**values, **frame}.get(name, 0.0)) for name in _LENS)
+        for where, frame in with_depth
+    }
     if len(lenses) > 1:
         raise DatasetError(f"{path}: its frames have different lenses ({', '.join(_LENS)}); one is read")
     size, turned = first_size(files[place] for place in order), options.conventions.turned
@@ -104,18 +105,15 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    text = read_text(path, DatasetError, most_bytes=_MOST_BYTES)
+    values: dict[str, Any] = json_values(read_text(path, DatasetError, most_bytes=_MOST_BYTES), path)
     try:
-        values = json.loads(text)
         if not all(isinstance(frame, dict) for frame in values["frames"]):
             raise TypeError
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        problem = f"not valid JSON: {said(error)}" if isinstance(error, ValueError) else "no list of frames"
-        raise DatasetError(f"{path}: {problem}") from None
+    except (KeyError, TypeError):
+        raise DatasetError(f"{path}: no list of frames") from None
     if not any(frame.get("depth_file_path") for frame in values["frames"]):
         raise DatasetError(f"{path}: none of its frames has a depth_file_path")
-    found: dict[str, Any] = values
-    return found
+    return values
 
 
 def _file(folder: Path, where: str, name: Any) -> Path:
@@ -123,13 +121,6 @@ def _file(folder: Path, where: str, name: Any) -> Path:
     if not isinstance(name, str) or len(name) > 4096 or "\0" in name:
         raise DatasetError(f"{where}: a path is a text, not {str(name)[:40]}")
     return beside(folder, name)
-
-
-def _in_order(path: Path) -> list[tuple[int, str]]:
-    """Key of a file's name in which numbers count as such."""
-    return [
-        (int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d{1,18})", path.stem)
-    ]
 
 
 def _camera(where: str, values: Entry) -> PinholeCamera:
@@ -162,10 +153,6 @@ def _of_depth(path: Path, camera: PinholeCamera, size: tuple[int, int] | None, t
             f"{camera.width} x {camera.height}{turn_hint(camera, size)}"
         )
     return scaled
-
-
-def _lens(where: str, values: Entry) -> tuple[float, ...]:
-    return tuple(_number(where, name, values.get(name, 0.0)) for name in _LENS)
 
 
 def _pose(where: str, frame: Entry, scale: float, scale_of_positions: float) -> Pose:

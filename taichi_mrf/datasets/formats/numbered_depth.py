@@ -136,12 +136,10 @@ def _find_trajectory(folder: Path, images: Sequence[Path], may_lack: bool) -> Tr
 def _poses_by_number(
     numbers: list[int], trajectory: Trajectory, gap: float
 ) -> tuple[dict[int, RecordedPose | None], list[str]]:
-    """The pose of each image number, None where one is missing, and notes for the report.
-
-    Numbers outside a stamped trajectory are left out, and so are those that are times (ms, us or ns since
-    1970) without a pose within the ``gap`` in seconds. Poses without stamps go with the images in their
-    order if there are as many, else by number.
-    """
+    """The pose of each image number, None where one is missing, and notes for the report. Numbers outside a
+    stamped trajectory are left out, and so are those that are times (ms, us or ns since 1970) without a pose
+    within the ``gap`` in seconds. Poses without stamps go with the images in their order if there are as
+    many, else by number."""
     poses, name = trajectory.poses, trajectory.path.name
     by_key = {pose.key: pose for pose in poses}
     if trajectory.layout == "stamped" and in_seconds(numbers[0]) != numbers[0]:

@@ -14,7 +14,6 @@ anything is unpacked. Unpacking needs the extra ``record3d``. Level 2 leaves the
 and pixels of level 0 are no measurements.
 """
 
-import json
 import math
 import struct
 import weakref
@@ -31,6 +30,7 @@ from taichi_mrf.datasets.base import NumberedRow, Table, start_pose
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.images import decode_color
+from taichi_mrf.datasets.intrinsics import json_values
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import ConfigError, DatasetError, naming, said
@@ -207,10 +207,7 @@ class Metadata:
 
 def read_metadata(where: str, data: bytes) -> Metadata:
     """The metadata in a file. Raises DatasetError, which begins with ``where`` and names the entry."""
-    try:
-        values = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{where}: not valid JSON: {said(error)}") from error
+    values = json_values(data, where)
     if not isinstance(values, dict):
         raise DatasetError(f"{where}: expected an object with K, w, h and poses")
     shape = None

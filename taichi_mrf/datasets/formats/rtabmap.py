@@ -51,7 +51,7 @@ from taichi_mrf.datasets.images import (
     share_of_largest,
 )
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, watched
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, naming, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -70,8 +70,7 @@ _MOST_PACKED = 1 << 28
 
 @dataclass(frozen=True)
 class Node:
-    """A node: its session, when it was made, in seconds, and the robot's pose by odometry (4, 4), None if it
-    has none."""
+    """A node: its session, its time in seconds, and the robot's pose by odometry (4, 4), if it has one."""
 
     id: int
     session: int
@@ -152,8 +151,7 @@ class RtabmapDatabase:
             yield id, blob
 
     def images(self, id: int, color: bool) -> tuple[bytes, bytes | None]:
-        """A node's encoded depth image, and its colour image if it has one and ``color``. Raises
-        DatasetError."""
+        """A node's encoded depth image, and with ``color`` its colour image, if any. Raises DatasetError."""
         rows = self._rows(f"SELECT depth, {'image' if color else 'NULL'} FROM Data WHERE id = ?", (id,))
         depth, image = next(iter(rows), (None, None))
         self._check(isinstance(depth, bytes), f"node {id} has no depth image")
@@ -233,8 +231,8 @@ class NodeCamera:
 
 
 def node_camera(blob: bytes, version: tuple[int, ...], where: str) -> NodeCamera:
-    """A node's camera. Raises DatasetError, whose text begins with ``where``, for a damaged blob, a stereo
-    pair and several cameras."""
+    """A node's camera. Raises DatasetError, which begins with ``where``, for a damaged blob, a stereo pair
+    and several cameras."""
     with naming(where, DatasetError, KeyframeError, ConfigError):
         return _with_header(blob) if version >= WITH_HEADER else _plain(blob)
 
@@ -266,10 +264,8 @@ def _plain(blob: bytes) -> NodeCamera:
     numbers = np.frombuffer(blob, "<f4").astype(np.float64)
     count = len(numbers) - _TRANSFORM
     _refuse(stereo=count in (5, 7), several=count > 7)
-    if count not in (4, 6):
-        raise DatasetError("the calibration is damaged")
     size = numbers[4:6] if count == 6 else np.zeros(2)
-    if not (np.isfinite(size).all() and (size >= 0).all() and (size < _MOST).all()):
+    if count not in (4, 6) or not (np.isfinite(size).all() and (size >= 0).all() and (size < _MOST).all()):
         raise DatasetError("the calibration is damaged")
     return _camera(numbers[:4], int(size[0]), int(size[1]), np.zeros(0), numbers[count:])
 
@@ -319,7 +315,7 @@ def depth_size(data: bytes) -> tuple[int, int] | None:
 
 def decode_depth(data: bytes, where: str, steps_per_metre: float) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, 0 for no measurement. ``steps_per_metre`` is for images of whole
-    numbers. Raises DatasetError, whose text begins with ``where``, for a damaged image."""
+    numbers. Raises DatasetError, which begins with ``where``, for a damaged image."""
     if data.startswith(INVERSE) and len(data) >= _RVL_HEADER:
         a, b = struct.unpack_from("<2f", data, len(INVERSE))
         steps = _whole(data[_RVL_HEADER:], where).astype(np.float32)
@@ -370,23 +366,18 @@ class RtabmapRecording(Table[PosedNode]):
         """A note of whole numbers that are no measurements; the unit is known."""
         shares = []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
-            try:
+            with contextlib.suppress(DatasetError):  # no PNG, or reported when its frame is read
                 depth, _ = self.database.images(row.node.id, color=False)
                 shares.append(share_of_largest(decode_unchanged(depth, row.pose_source)))
-            except DatasetError:  # of another kind than PNG, or reported when its frame is read
-                continue
         return note_of_largest(shares)
 
     def load(self, index: int, row: PosedNode, T_world_camera: Pose) -> Frame:
-        """Decode a node's images."""
         where = f"{self.database.path}: node {row.node.id}"
         depth, image = self.database.images(row.node.id, self.color)
         depth_m = decode_depth(depth, f"{where}: depth", self.steps_per_metre)
         height, width = depth_m.shape
-        try:
+        with naming("", ConfigError):
             camera = row.camera.of_images(width, height) if self.own_cameras else self.camera
-        except ConfigError as error:
-            raise DatasetError(str(error)) from error
         if depth_m.shape != camera.shape:
             raise DatasetError(
                 f"{where}: depth is {width} x {height}, the camera {camera.width} x {camera.height}"
@@ -474,7 +465,4 @@ def changing_poses(path: Path) -> ChangedPoses:
     return {each.stamp: each.pose for each in nodes}
 
 
-def open_poses(path: Path, query: str) -> PoseSource:
-    if query:
-        raise DatasetError(f"{path}: takes no options after a question mark; bags do")
-    return WatchedFile(path, changing_poses, beside=("-wal", "-journal"), is_text=False)
+open_poses = watched(changing_poses, beside=("-wal", "-journal"), is_text=False)

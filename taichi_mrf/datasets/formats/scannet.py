@@ -46,14 +46,8 @@ FRAMES_PER_SECOND = 30.0
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the tracked images in the order of their numbers. One whose pose is missing is listed, and named
     in an error when it is read."""
-    images = sorted(
-        (
-            path
-            for path in (folder / "depth").iterdir()
-            if path.suffix in DEPTH_SUFFIXES and path.stem.isdecimal()
-        ),
-        key=lambda path: int(path.stem),
-    )
+    found = (p for p in (folder / "depth").iterdir() if p.suffix in DEPTH_SUFFIXES and p.stem.isdecimal())
+    images = sorted(found, key=lambda path: int(path.stem))
     if not images:
         hint = hint_for(folder / "depth")
         raise DatasetError(f"{folder / 'depth'}: {hint or 'contains no N.png'}")

@@ -63,16 +63,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     camera, notes = find_camera(folder, options, CAMERA, NAME, (frame.depth_file for frame in frames))
     color = COLOR if camera == CAMERA else None
     return recording(
-        folder,
-        options,
-        camera,
-        frames,
-        STEPS_PER_METRE,
-        NAME,
-        notes,
-        len(numbers),
-        LOST,
-        color_camera=color,
+        folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(numbers), LOST, color_camera=color
     )
 
 

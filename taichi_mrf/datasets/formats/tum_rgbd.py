@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, StampedPoses
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import PRIMESENSE, ReadOptions
@@ -24,7 +24,6 @@ from taichi_mrf.datasets.recording import RecordedFrame, beside, recording
 from taichi_mrf.datasets.timed_poses import apart_in_words, check_unit
 from taichi_mrf.datasets.trajectories import (
     OTHERWISE,
-    Trajectory,
     is_trajectory,
     poses_at_start,
     read_trajectory,
@@ -90,14 +89,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes.append(f"{lost} of {len(trajectory.poses)} poses of {poses.name} left out: tracking was lost")
     if dropped:
         notes.append(f"{dropped} of {len(depth)} depth images dropped: no unused pose within {gap:g} s")
-    track = partial(_track, replace(trajectory, poses=tuple(known)))
+    track = partial(valid_poses, replace(trajectory, poses=tuple(known)))
     return recording(folder, options, camera, frames, STEPS_PER_METRE, NAME, notes, len(depth), track=track)
-
-
-def _track(trajectory: Trajectory) -> StampedPoses:
-    """The poses of a trajectory with their stamps."""
-    keys, poses = valid_poses(trajectory)
-    return keys, poses
 
 
 def _poses(folder: Path, may_lack: bool) -> Path:
@@ -113,11 +106,9 @@ def _poses(folder: Path, may_lack: bool) -> Path:
 
 
 def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
-    """For each stamp (seconds) the index of its partner in ``others``, or None.
-
-    No pair is further apart than ``largest_gap``, no partner is given twice, and the closest pairs are
-    made first. Neither list needs to be sorted.
-    """
+    """For each stamp (seconds) the index of its partner in ``others``, or None. No pair is further apart than
+    ``largest_gap``, no partner is given twice, and the closest pairs are made first. Neither list needs to be
+    sorted."""
     order = np.argsort(others, kind="stable")
     ordered = np.asarray(others, dtype=np.float64)[order]
     pairs = []

@@ -59,13 +59,11 @@ class _BadLineError(Exception):
 def read_carmen_log(
     path: Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
 ) -> LaserScans:
-    """Read all scans of a log. Raises DatasetError, which names the file and the line.
-
-    A beam of at least ``no_return_m`` metres has no return. Without it the range is found in the log
-    (find_no_return_m); a line of ROBOTLASER1 also gives the scanner's greatest range. Beams without a return
-    carry no evidence (``no_return_is_free`` is False): in the logs that this was measured on, 59% (Intel) and
-    95% (Freiburg 079) of them would go through a wall within 5 m.
-    """
+    """Read all scans of a log. Raises DatasetError, which names the file and the line. A beam of at least
+    ``no_return_m`` metres has no return. Without it the range is found in the log (find_no_return_m); a line
+    of ROBOTLASER1 also gives the scanner's greatest range. Beams without a return carry no evidence
+    (``no_return_is_free`` is False): in the logs that this was measured on, 59% (Intel) and 95% (Freiburg
+    079) of them would go through a wall within 5 m."""
     scans: list[_Scan] = []
     problems: list[str] = []
     try:
@@ -118,11 +116,9 @@ def _no_return_note(
 
 
 def field_of_view_angles(beams: int) -> NDArray[np.float64]:
-    """The angles of FLASER's beams, (beams,) radians: from -90 degrees on, in steps of 180 / n.
-
-    An odd number (181, 361) includes both ends. An even one (180, 360) lacks the last: of the ways to lay
-    180 degrees under so many beams, this one gives the sharpest map of the Intel and Freiburg 079 logs.
-    """
+    """The angles of FLASER's beams, (beams,) radians: from -90 degrees on, in steps of 180 / n. An odd number
+    (181, 361) includes both ends. An even one (180, 360) lacks the last: of the ways to lay 180 degrees under
+    so many beams, this one gives the sharpest map of the Intel and Freiburg 079 logs."""
     steps = beams - 1 if beams % 2 and beams > 1 else beams
     return -math.pi / 2 + math.pi * np.arange(beams) / steps
 
@@ -217,21 +213,6 @@ FILE_NAME = "scans.npz"
 _ZIP_MAGIC = b"PK"
 
 
-def _is_npz(path: Path) -> bool:
-    """True if a file is of this format, damaged or not."""
-    with open_regular(path, DatasetError) as file:
-        return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
-
-
-def holds_ranges(path: Path) -> bool:
-    """True if an npz file has an array of ranges."""
-    try:
-        with open_npz(path, DatasetError, "an npz file that can be read") as file:
-            return "range_m" in file
-    except DatasetError:
-        return False
-
-
 def read_scan_npz(
     path: Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
 ) -> LaserScans:
@@ -308,14 +289,11 @@ _LOOKED_AT_BYTES = 1 << 16
 def open_scans(
     source: str | Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
 ) -> LaserScans:
-    """Read a CARMEN log (plain or gzip), an npz file or a folder with ``scans.npz``, or make the
-    scans of a built-in source such as ``synthetic:floor-plan?scans=200``.
-
-    Beams of at least ``no_return_m`` metres have no return; None leaves it to the reader. Raises
-    DatasetError, which names the file and the line or the scan, if something cannot be read, and for beams
-    with a NaN, negative or infinite range. With ``skip_bad_scans`` broken scans are left out and
-    counted in the notes, as long as one is left.
-    """
+    """Read a CARMEN log (plain or gzip), an npz file or a folder with ``scans.npz``, or make the scans of a
+    built-in source such as ``synthetic:floor-plan?scans=200``. Beams of at least ``no_return_m`` metres have
+    no return; None leaves it to the reader. Raises DatasetError, which names the file and the line or the
+    scan, if something cannot be read, and for beams with a NaN, negative or infinite range. With
+    ``skip_bad_scans`` broken scans are left out and counted in the notes, as long as one is left."""
     path = Path(source)
     if re.match(r"[a-z][a-z0-9_]+:", str(source)) and not exists(path):
         return floor_plan_scans.open_floor_plan(str(source))
@@ -328,9 +306,10 @@ def open_scans(
             f"{source}: no such file, and no built-in scans of that name ({floor_plan_scans.NAME})"
         )
     try:
-        if _is_npz(path):
-            return read_scan_npz(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
-        return read_carmen_log(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
+        with open_regular(path, DatasetError) as file:
+            is_npz = file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
+        read = read_scan_npz if is_npz else read_carmen_log
+        return read(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -341,9 +320,10 @@ def holds_scans(path: Path) -> bool:
         path = path / FILE_NAME
     if not is_file(path):
         return False
-    if path.suffix == ".npz":
-        return holds_ranges(path)
     try:
+        if path.suffix == ".npz":
+            with open_npz(path, DatasetError, "an npz file that can be read") as arrays:
+                return "range_m" in arrays
         with open_regular(path, DatasetError) as file:
             head = file.read(_LOOKED_AT_BYTES) or b""  # None: a device without news
         if head[:2] == GZIP_MAGIC:

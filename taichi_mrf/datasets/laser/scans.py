@@ -39,10 +39,7 @@ class FloorPlan:
     def upper_x_y(self) -> tuple[float, float]:
         """The image's upper right corner in metres."""
         height, width = self.wall.shape
-        return (
-            self.lower_x_y[0] + width * self.pixel_x_y[0],
-            self.lower_x_y[1] + height * self.pixel_x_y[1],
-        )
+        return (self.lower_x_y[0] + width * self.pixel_x_y[0], self.lower_x_y[1] + height * self.pixel_x_y[1])
 
     def moved(self, x: float, y: float) -> "FloorPlan":
         """The plan, shifted by ``x`` and ``y`` metres."""
@@ -70,10 +67,8 @@ class FloorPlan:
 
 
 def read_floor_plan(path: str | Path, size_x_y: tuple[float, float]) -> FloorPlan:
-    """Read an image of a floor plan, dark where there is a wall, of a given width and height in metres.
-
-    It is centred on the world's origin, as Player/Stage places its bitmaps. Raises DatasetError.
-    """
+    """Read an image of a floor plan, dark where there is a wall, of a given width and height in metres. It is
+    centred on the world's origin, as Player/Stage places its bitmaps. Raises DatasetError."""
     if not all(math.isfinite(side) and side > 0 for side in size_x_y):
         raise DatasetError(f"{path}: the size of a floor plan must be two positive numbers, not {size_x_y}")
     image = read_grey(Path(path))
@@ -100,12 +95,10 @@ _STRAY_SHARE = 0.01
 
 
 def find_no_return_m(range_m: NDArray[np.floating], pose_x_y_theta: NDArray[np.floating]) -> float | None:
-    """The least range (metres) that means no return, or None if no value stands out.
-
-    ``range_m`` (N, B) are all scans, ``pose_x_y_theta`` (N, 3) the poses of the scanner. The value has at
-    least 20 beams, ten times as many as any bin of 1 cm between half of it and itself, is reported from
-    places at least 1 m apart, and hardly any range (1% of those beams) is larger.
-    """
+    """The least range (metres) that means no return, or None if no value stands out. ``range_m`` (N, B) are
+    all scans, ``pose_x_y_theta`` (N, 3) the poses of the scanner. The value has at least 20 beams, ten times
+    as many as any bin of 1 cm between half of it and itself, is reported from places at least 1 m apart, and
+    hardly any range (1% of those beams) is larger."""
     steps = np.rint(np.minimum(range_m[range_m > 0], _LONGEST_M) / _STEP_M).astype(np.int64)
     count = np.bincount(steps)
     above = np.concatenate([np.cumsum(count[::-1])[::-1][1:], [0]])
@@ -124,12 +117,9 @@ def find_no_return_m(range_m: NDArray[np.floating], pose_x_y_theta: NDArray[np.f
 
 @dataclass(frozen=True)
 class LaserScans:
-    """N scans of B beams each, in one world frame.
-
-    A beam of scan i leaves ``pose_x_y_theta[i]``, the pose of the scanner, at the angle theta + ``angle_rad``
-    from the world's x axis, counter-clockwise. Ranges are positive; beams
-    of range 0 are left out.
-    """
+    """N scans of B beams each, in one world frame. A beam of scan i leaves ``pose_x_y_theta[i]``, the pose of
+    the scanner, at the angle theta + ``angle_rad`` from the world's x axis, counter-clockwise. Ranges are
+    positive; beams of range 0 are left out."""
 
     name: str
 
@@ -178,12 +168,10 @@ def skipped_note(problems: list[str]) -> tuple[str, ...]:
 
 
 def beams_of(scans: LaserScans, max_range_m: float = 0.0, no_return_is_free: bool | None = None) -> Beams:
-    """All beams of all scans, in their order, in the plane z = 0 of the world frame.
-
-    A beam longer than ``max_range_m`` (0: no limit) is cut there and then only marks its way as free.
-    Beams of range 0 are left out, and so are those without a return, unless they mark their way as free:
-    ``no_return_is_free``, or by default what the scans have.
-    """
+    """All beams of all scans, in their order, in the plane z = 0 of the world frame. A beam longer than
+    ``max_range_m`` (0: no limit) is cut there and then only marks its way as free. Beams of range 0 are left
+    out, and so are those without a return, unless they mark their way as free: ``no_return_is_free``, or by
+    default what the scans have."""
     count, beams = scans.range_m.shape
     angle = scans.pose_x_y_theta[:, 2:] + scans.angle_rad
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1).reshape(-1, 3)

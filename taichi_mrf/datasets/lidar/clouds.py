@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.lidar.las_file import read_las
-from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.datasets.trajectories import floats, pose_from_quaternion
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.bounded import MOST_DIGITS
@@ -30,8 +30,7 @@ LARGEST_RATIO = 88
 
 
 def unpack_lzf(packed: bytes, size: int) -> bytes:
-    """The ``size`` bytes that are packed. Raises ValueError if they are others, or refer to what is not
-    there."""
+    """The ``size`` bytes that are packed. Raises ValueError if they are others, or refer to others."""
     out, at, end = bytearray(), 0, len(packed)
     while at < end:
         control = packed[at]
@@ -76,10 +75,7 @@ def text_columns(
         words = line.split()
         if len(words) != columns:
             raise DatasetError(f"{path}: point {row} has {len(words)} values, expected {columns}")
-        try:
-            found[row] = [float(words[column]) for column in wanted]
-        except ValueError:
-            raise DatasetError(f"{path}: point {row} contains something that is not a number") from None
+        found[row] = floats((words[column] for column in wanted), f"{path}: point {row}")
     return found
 
 
@@ -115,11 +111,9 @@ def read_pcd_header(path: Path) -> PcdHeader:
 
 
 def read_pcd(path: Path) -> tuple[NDArray[np.float64], Pose]:
-    """Points (N, 3) in metres as they are in the file, NaN included, and the pose in VIEWPOINT.
-
-    Raises DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
-    CapacityError for one that does not fit into memory.
-    """
+    """Points (N, 3) in metres as they are in the file, NaN included, and the pose in VIEWPOINT. Raises
+    DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
+    CapacityError for one that does not fit into memory."""
     data = read_bytes(path, DatasetError)
     header = _pcd_header(path, data[:_LONGEST_HEADER])
     with naming(f"{path}: VIEWPOINT", KeyframeError):
@@ -148,7 +142,7 @@ def _pcd_header(path: Path, data: bytes) -> PcdHeader:
     encoding = " ".join(entries["DATA"]).lower()
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise DatasetError(f"{path}: DATA {encoding[:40]!r} is not ascii, binary or binary_compressed")
-    viewpoint = _numbers(path, "VIEWPOINT", entries.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"])
+    viewpoint = floats(entries.get("VIEWPOINT") or [0, 0, 0, 1, 0, 0, 0], f"{path}: VIEWPOINT")
     if len(viewpoint) != 7:
         raise DatasetError(f"{path}: VIEWPOINT has {len(viewpoint)} numbers, not tx ty tz qw qx qy qz")
     return PcdHeader(dtype, points, tuple(viewpoint), encoding, start)
@@ -245,13 +239,6 @@ def _stacked(columns: "dict[str, NDArray] | NDArray") -> NDArray[np.float64]:
     return np.stack([part.astype(np.float64) for part in parts], axis=-1)
 
 
-def _numbers(path: Path, entry: str, words: list[str]) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        raise DatasetError(f"{path}: {entry} contains something that is not a number") from None
-
-
 def _whole(path: Path, entry: str, word: str) -> int:
     try:
         return int(word)
@@ -286,11 +273,8 @@ def read_ply_header(path: Path) -> PlyHeader:
 
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
-    """x, y and z of the vertices, (N, 3), NaN included.
-
-    Raises DatasetError, which names the file and the entry, for a file that is cut short or damaged, and
-    CapacityError for one that does not fit into memory.
-    """
+    """x, y and z of the vertices, (N, 3), NaN included. Raises DatasetError, which names the file and the
+    entry, for a damaged file, and CapacityError for one that does not fit into memory."""
     data = read_bytes(path, DatasetError)
     header = _ply_header(path, data[:_LONGEST_HEADER])
     names = header.dtype.names or ()
@@ -305,9 +289,7 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
         raise DatasetError(
             f"{path}: is cut short: {header.vertices} vertices take {needed} bytes, it has {held}"
         )
-    vertices = np.frombuffer(data, header.dtype, header.vertices, header.start)
-    with np.errstate(invalid="ignore"):
-        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    return _stacked(np.frombuffer(data, header.dtype, header.vertices, header.start))
 
 
 def _ply_header(path: Path, data: bytes) -> PlyHeader:
@@ -416,10 +398,6 @@ def layout_notes(clouds: Sequence[Path]) -> list[str]:
     return []
 
 
-def _float_points(path: Path) -> NDArray[np.float64]:
-    return _float_table(path)[:, :3].astype(np.float64)
-
-
 def _float_table(path: Path) -> NDArray[np.float32]:
     """x y z, and as many more numbers as each point has (_COLUMNS), as little-endian float32."""
     data = read_bytes(path, DatasetError, "the scan is missing")
@@ -443,28 +421,12 @@ def _spread(table: NDArray[np.float32]) -> float:
     return float(np.log(rows.var(axis=0) + 1e-4).mean()) if len(rows) >= _LEAST_POINTS else 0.0
 
 
-def _pcd_points(path: Path) -> NDArray[np.float64]:
-    return read_pcd(path)[0]
-
-
 READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".npz": _npz_points,
     ".ply": read_ply_points,
-    ".pcd": _pcd_points,
-    ".bin": _float_points,
+    ".pcd": lambda path: read_pcd(path)[0],
+    ".bin": lambda path: _float_table(path)[:, :3].astype(np.float64),
     ".las": read_las,
     ".laz": read_las,
 }
 """Reader of a file, by its ending."""
-
-
-def natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """A key that orders names by the numbers in them: scan-9 before scan-10."""
-    words = re.split(r"(\d+)", path.stem)
-    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words], path.name
-
-
-def number_of(path: Path) -> int | None:
-    """The last number in a file's name, None if there is none."""
-    numbers = re.findall(r"\d+", path.stem)
-    return int(numbers[-1]) if numbers else None

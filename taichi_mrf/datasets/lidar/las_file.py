@@ -128,8 +128,7 @@ def _check_chunk_size(stream: BinaryIO, place: int, records: int, count: int) ->
 
 
 def _check_chunks(stream: BinaryIO, begin: int, size: int, point_bytes: int) -> None:
-    """Raise ValueError if there are more chunks of packed points than the file can hold: the first point of
-    each is not packed."""
+    """Raise ValueError if there are more packed chunks than fit: the first point of each is not packed."""
     stream.seek(begin)
     (table,) = struct.unpack("<q", stream.read(8))
     if table == -1:  # written as a stream: the last bytes tell it

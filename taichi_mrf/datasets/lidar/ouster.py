@@ -268,7 +268,7 @@ class Columns:
 def columns_of(source: Any, number: int, sensor: int) -> Columns | None:
     """A scan of one sensor, None if it has no column. Raises DatasetError if it cannot be decoded."""
     try:
-        frame = _of_sensor(source[number], sensor)
+        frame = next(islice(source[number], sensor, None), None)
         if frame is None:
             return None
         valid = (np.asarray(frame.status) & 1) > 0
@@ -306,11 +306,8 @@ def _pose(path: Path, T_world_sensor: Pose | None, T_sensor_lidar: Pose) -> Pose
 
 def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     """Open a recording with the options after the question mark of its name, and read the stamps of its
-    scans.
-
-    Raises DatasetError, which names the file, if ouster-sdk is not installed, metadata are missing, and if no
-    scan can be read or has a pose.
-    """
+    scans. Raises DatasetError, which names the file, if ouster-sdk is not installed, metadata are missing,
+    and if no scan can be read or has a pose."""
     chosen = parse_options(OusterOptions, query, str(path))
     refuse_image_options(f"{path}", options)
     check_regular(path, DatasetError)
@@ -396,8 +393,3 @@ def _beams(path: Path, source: Any, sensor: int) -> Beams:
         raise DatasetError(f"{path}: has {len(infos)} sensors, so there is no sensor {sensor}")
     with naming(f"{path}: sensor {sensor}"):
         return Beams.of(infos[sensor])
-
-
-def _of_sensor(frames: Any, sensor: int) -> Any | None:
-    """The scan of one sensor in what the source gives at a time."""
-    return next(islice(frames, sensor, None), None)

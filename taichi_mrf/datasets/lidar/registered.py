@@ -51,12 +51,10 @@ Points = NDArray[np.float64]
 def in_world(
     count: int, read_pose: Callable[[int], Pose], read_points: Callable[[int], Points]
 ) -> bool | None:
-    """True if points are in the world's frame, False if in the sensor's, None if nothing tells.
-
-    Looks at a few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in
-    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Raises DatasetError
-    if poses are clearly the inverse, or a camera's.
-    """
+    """True if points are in the world's frame, False if in the sensor's, None if nothing tells. Looks at a
+    few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in their file;
+    scans that cannot be read (DatasetError, KeyframeError) are passed over. Raises DatasetError if poses are
+    clearly the inverse, or a camera's."""
     votes, overlaps = [], []
     for first in np.unique(np.linspace(0, count, _PLACES + 1).astype(int)[:_PLACES]) if count else []:
         try:
@@ -175,8 +173,7 @@ def _distances(first: Points, second: Points, T_first: Pose, T_second: Pose) -> 
 
 
 def _thinned(points: Points, most: int) -> Points:
-    """At most so many of the points (N, 3), one in a cell: the rings of a lidar move with it, and are no
-    surfaces."""
+    """At most so many of the points (N, 3), one in a cell: the rings of a lidar are no surfaces."""
     points = points[np.random.default_rng(0).permutation(len(points))]
     _, first = np.unique(np.floor(points / _CELL_M), axis=0, return_index=True)
     return points[np.sort(first)[:most]]

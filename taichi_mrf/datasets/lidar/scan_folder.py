@@ -22,18 +22,11 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import pose_of
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.hints import unread_poses
-from taichi_mrf.datasets.lidar.clouds import (
-    READERS,
-    is_cloud,
-    layout_notes,
-    natural,
-    number_of,
-    read_cloud,
-    read_pcd_header,
-)
+from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, layout_notes, read_cloud, read_pcd_header
 from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, read_of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
+from taichi_mrf.datasets.recording import natural, number_in
 from taichi_mrf.datasets.stereo.matching import read_times
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.datasets.trajectories import TEXTS, in_seconds, is_trajectory, read_trajectory
@@ -122,7 +115,7 @@ def _check_one_map(path: Path, clouds: Sequence[Path], poses: int) -> None:
 
 def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
     """The numbers in the names of scans, by which they find their poses in a file."""
-    numbers = [number for cloud in clouds if (number := number_of(cloud)) is not None]
+    numbers = [number for cloud in clouds if (number := number_in(cloud.stem)) is not None]
     if len(set(numbers)) < len(clouds):
         raise DatasetError(
             f"{path}: its poses go by the numbers of scans, but names such as {clouds[0].name} have no "
@@ -213,8 +206,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """List the clouds in the order of their stamps. Raises DatasetError, which names the folder
-    or the file."""
+    """List the clouds in the order of their stamps. Raises DatasetError, which names folder or file."""
     chosen = parse_options(FolderOptions, query, str(path))
     clouds = clouds_of(path)
     poses = Path(chosen.poses) if chosen.poses else find_poses(path) if is_folder(path) else None
@@ -265,8 +257,7 @@ def _read_metres(cloud: Path, options: ReadOptions) -> NDArray[np.float64]:
 
 
 def clouds_of(folder: Path) -> list[Path]:
-    """The clouds in a folder, or in the one below it that has some, all of the kind of the first. A file
-    is one itself."""
+    """The clouds in a folder or one below it, all of the kind of the first. A file is one itself."""
     if is_file(folder):
         return [folder] if folder.suffix.lower() in READERS else []
     for place in CLOUD_PLACES:
@@ -329,8 +320,7 @@ def _frame_of(
     clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool, options: ReadOptions
 ) -> tuple[bool, list[str]]:
     """True if points are in the world's frame, as those of PCDs with ``viewpoints`` are unless others fit
-    better, and a note where it is not as documented. Raises DatasetError for poses in other
-    conventions."""
+    better, and a note where it is not as documented. Raises DatasetError for poses in other conventions."""
     found = in_world(
         len(clouds),
         lambda i: pose_of(poses[clouds[i]].read(), options.conventions),

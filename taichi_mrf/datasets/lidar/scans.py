@@ -53,8 +53,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Motion:
-    """When and where a lidar measured: the ``stamp`` of a scan in seconds, the lidar's pose then, and its
-    pose at any time."""
+    """When and where a lidar measured: the ``stamp`` of a scan in seconds, its pose then and at any time."""
 
     stamp: float
     T_world_lidar: Pose
@@ -270,12 +269,10 @@ SECONDS_PER_SCAN = 0.1
 
 @dataclass(frozen=True)
 class RecordedScan(Row):
-    """One scan of a recording, whose pose is T_world_sensor.
-
-    ``read_points`` gives its points (N, 3) in metres in the sensor's frame, of which it gets the pose, NaN
-    and 0 where nothing came back; ``source`` is their file. ``starts`` gives the places (N, 3) in that frame
-    from which they were measured, None if that is its pose. Both raise DatasetError, which names the file.
-    """
+    """One scan of a recording, whose pose is T_world_sensor. ``read_points`` gives its points (N, 3) in
+    metres in the sensor's frame, of which it gets the pose, NaN and 0 where nothing came back; ``source`` is
+    their file. ``starts`` gives the places (N, 3) in that frame from which they were measured, None if that
+    is its pose. Both raise DatasetError, which names the file."""
 
     read_points: Callable[[Pose], NDArray[np.float64]]
     source: str

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from taichi_mrf.datasets.base import when_called
+from taichi_mrf.datasets.entries import reader
 from taichi_mrf.datasets.intrinsics import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
 from taichi_mrf.datasets.ros.names import METADATA, is_bag
@@ -52,11 +52,9 @@ class PoseSource(Protocol):
         ...
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
-        """All poses that are known now, None if they are those of the last call.
-
-        ``stamp_s`` is the recording's time in seconds, infinite once the recording is over: a source that has
-        times of its own gives what was known then. Does not wait.
-        """
+        """All poses that are known now, None if they are those of the last call. ``stamp_s`` is the
+        recording's time in seconds, infinite once the recording is over: a source that has times of its own
+        gives what was known then. Does not wait."""
         ...
 
 
@@ -86,7 +84,6 @@ class CallbackPoses:
     problem: str | None = None
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
-        """Poses that the function returns."""
         return self.function(stamp_s)
 
 
@@ -123,7 +120,6 @@ class WatchedFile:
 
     @property
     def name(self) -> str:
-        """The path."""
         return str(self._path)
 
     @property
@@ -133,8 +129,7 @@ class WatchedFile:
         return self._error if lasts else None
 
     def read_now(self) -> ChangedPoses:
-        """The poses as they are now. Raises DatasetError, which names the file and the line, if they cannot
-        be read."""
+        """The poses as they are now. Raises DatasetError, which names the file and the line."""
         self._seen, self._seen_at, self._is_read = self._signature(), self._clock(), True
         return self._read(self._path)
 
@@ -183,50 +178,45 @@ def _poses_in(trajectory: Trajectory) -> ChangedPoses:
     return dict(zip(map(kind, keys), poses, strict=True))
 
 
-def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], PoseSource]:
-    """Opener of a text file that ``read`` reads."""
+def watched(
+    read: Callable[[Path], ChangedPoses], beside: tuple[str, ...] = (), is_text: bool = True
+) -> Callable[[Path, str], PoseSource]:
+    """Opener of a file that ``read`` reads, as a WatchedFile."""
 
     def open_file(path: Path, query: str) -> WatchedFile:
         if query:
             raise DatasetError(f"{path}: takes no options after a question mark; bags do")
-        return WatchedFile(path, read)
+        return WatchedFile(path, read, beside, is_text)
 
     return open_file
-
-
-def _graph_poses(path: Path) -> ChangedPoses:
-    return {int(number): T for number, T in read_pose_graph(path, with_edges=False).poses.items()}
 
 
 BAG = PoseKind(
     "ROS bag",
     f"a bag ({', '.join(BAGS)}, or a folder with {METADATA}) with a Path, tf or poses",
     is_bag,
-    when_called("taichi_mrf.datasets.ros.pose_history:open_history"),
+    reader("ros.pose_history:open_history"),
 )
 RTABMAP = PoseKind(
-    "RTAB-Map",
-    "a database (.db)",
-    lambda path: path.suffix == ".db",
-    when_called("taichi_mrf.datasets.formats.rtabmap:open_poses"),
+    "RTAB-Map", "a database (.db)", lambda path: path.suffix == ".db", reader("formats.rtabmap:open_poses")
 )
 GRAPH = PoseKind(
     "pose graph",
     f"VERTEX_SE3:QUAT or VERTEX3 lines ({', '.join(SUFFIXES)})",
     is_pose_graph,
-    _watched(_graph_poses),
+    watched(lambda path: dict(read_pose_graph(path, with_edges=False).poses.items())),
 )
 OPEN3D = PoseKind(
     "Open3D trajectory",
     "a PinholeCameraTrajectory or a PoseGraph (.json)",
     lambda path: path.suffix == ".json",
-    _watched(lambda path: _poses_in(_open3d(path))),
+    watched(lambda path: _poses_in(_open3d(path))),
 )
 TRAJECTORY = PoseKind(
     "trajectory",
     "lines of stamp tx ty tz qx qy qz qw (TUM), of 12 or 16 numbers (KITTI), or a .log",
     lambda path: not is_folder(path),
-    _watched(lambda path: _poses_in(read_trajectory(path))),
+    watched(lambda path: _poses_in(read_trajectory(path))),
 )
 
 KINDS: tuple[PoseKind, ...] = (BAG, RTABMAP, GRAPH, OPEN3D, TRAJECTORY)
@@ -234,7 +224,7 @@ KINDS: tuple[PoseKind, ...] = (BAG, RTABMAP, GRAPH, OPEN3D, TRAJECTORY)
 
 def open_pose_source(name: str | Path) -> PoseSource:
     """Open a file of poses, which may follow later if its name says of which kind it is; options of a bag
-    follow a question mark. Raises DatasetError, whose text names the file."""
+    follow a question mark. Raises DatasetError, which names the file."""
     text, query = str(name), ""
     if not exists(text) and "?" in text:
         text, _, query = text.rpartition("?")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.timed_poses import quaternion
-from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.datasets.trajectories import floats, pose_from_quaternion
 from taichi_mrf.errors import DatasetError, KeyframeError, naming
 from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
@@ -55,9 +55,8 @@ def is_pose_graph(path: Path) -> bool:
 
 
 def read_pose_graph(path: Path, with_edges: bool = True) -> PoseGraph:
-    """Read a graph, or its vertices alone. Raises DatasetError, whose text names the file and the line, if it
-    cannot be read, holds no pose in space, or a line does not hold the numbers that its first word
-    promises."""
+    """Read a graph, or its vertices alone. Raises DatasetError, which names the file and the line, if it
+    cannot be read, holds no pose in space, or a line has not the numbers that it should."""
     poses: dict[int, Pose] = {}
     keys: dict[int, int] = {}
     edges: list[PoseEdge] = []
@@ -116,11 +115,7 @@ def _key(words: Sequence[str], place: int, where: str) -> tuple[int, int]:
 
 
 def _numbers(words: Sequence[str], first: int, count: int, where: str) -> NDArray[np.float64]:
-    found = words[first : first + count]
-    try:
-        numbers = [float(word) for word in found]
-    except ValueError:
-        raise DatasetError(f"{where}: contains something that is not a number") from None
+    numbers = floats(words[first : first + count], f"{where}:")
     if len(numbers) < count:
         raise DatasetError(
             f"{where}: {words[0]} has {len(numbers)} numbers after its vertices, needs {count}"
@@ -152,10 +147,7 @@ def _information(words: Sequence[str], where: str) -> NDArray[np.float64] | None
     """The matrix (6, 6) of its upper triangle, row by row."""
     if not words:
         return None
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        raise DatasetError(f"{where}: contains something that is not a number") from None
+    numbers = floats(words, f"{where}:")
     if len(numbers) != _INFORMATION or not np.isfinite(numbers).all():
         raise DatasetError(f"{where}: expected {_INFORMATION} finite numbers of an information matrix")
     information = np.zeros((6, 6))

@@ -3,7 +3,6 @@ the source belongs to which frame.
 """
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
 from taichi_mrf.datasets.derived import Chosen, Derived, moved_note, origin_of, pose_of, stated_origin
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource, WatchedFile, open_pose_source
-from taichi_mrf.datasets.recording import Recording
+from taichi_mrf.datasets.recording import Recording, number_in
 from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, check_unit
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, collected_warnings, naming
@@ -31,8 +30,6 @@ stamps to milliseconds."""
 
 NAMED_UNKNOWN = 3
 """Frames that a warning names, at most."""
-
-_NUMBER = re.compile(r"\d+")
 
 
 class FramePoses:
@@ -122,8 +119,7 @@ class FramePoses:
         self.changes += 1
 
     def of(self, name: str, stamp_s: float) -> Pose | None:
-        """The pose (4, 4) of the frame with this name that was taken at this time; None if the source has
-        none."""
+        """The pose (4, 4) of the frame of this name and time; None if the source has none."""
         pose = self._poses.get(name)
         if pose is not None or not len(self._timed) or not math.isfinite(stamp_s):
             return pose
@@ -145,12 +141,6 @@ class FramePoses:
         own, index = self._by_own_number, self._by_index
         fits_own, fits_index = len(numbered.keys() & own.keys()), len(numbered.keys() & index.keys())
         return own if fits_own >= fits_index else index
-
-
-def number_in(name: str) -> int | None:
-    """The last number in a frame's name, None if there is none."""
-    found = _NUMBER.findall(name)
-    return int(found[-1]) if found else None
 
 
 @dataclass
@@ -194,8 +184,7 @@ class PosedFrames(Chosen):
         return replace(frame, T_world_camera=T_world_camera, origin_m=origin_m)
 
     def pose_now(self, name: str, stamp_s: float) -> Pose | None:
-        """The present pose (4, 4) of the frame with this name that was taken at this time; None if it is
-        the recorded one."""
+        """The present pose (4, 4) of the frame of this name and time; None if it is the recorded one."""
         T_world_camera = self.poses.of(name, stamp_s)
         index = self._index_of.get(name)
         if T_world_camera is not None or index is None:

@@ -200,8 +200,7 @@ class RealSenseOptions:
 class RealSenseCamera(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step;
     ``align`` is the library's, which brings colour to the depth camera's pixels, None without colour;
-    ``motion`` is its IMU, None if it has none or is not tracked; ``started`` says whether an
-    image has come."""
+    ``motion`` is its IMU, None if it has none or is not tracked; ``started`` if an image has come."""
 
     pipeline: Any = None
     align: Any = None
@@ -215,12 +214,10 @@ class RealSenseCamera(Dataset):
 
     @property
     def endless(self) -> bool:
-        """A camera never ends."""
         return True
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """Names without end."""
         return EndlessNames("realsense-")
 
     def read(self, index: int) -> Frame:
@@ -261,11 +258,8 @@ class RealSenseCamera(Dataset):
 
 def open_realsense(text: str, options: ReadOptions) -> Dataset:
     """Start the first RealSense camera that is found, or open a recording: ``FILE?option=value&...``, where
-    either may be missing.
-
-    Raises DatasetError for a missing library (with how to install it), for an error of the library, for a
-    wrong option, and for a depth scale, which the camera reports itself.
-    """
+    either may be missing. Raises DatasetError for a missing library (with how to install it), for an error of
+    the library, for a wrong option, and for a depth scale, which the camera reports itself."""
     file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
         raise DatasetError(f"{REALSENSE} takes no depth_scale: the camera reports its own")
@@ -289,8 +283,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
 
 
 def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
-    """The text after the colon, as a file's name and options; options alone need no question
-    mark."""
+    """The text after the colon, as a file's name and options; options alone need no question mark."""
     file, mark, query = text.partition("?")
     if not mark and "=" in text and not exists(Path(text)):
         file, query = "", text
@@ -339,8 +332,7 @@ def _open_camera(
 
 
 def _started(rs: Any, wanted: RealSenseOptions, color: bool) -> tuple[Any, Any] | str:
-    """A pipeline that has been started, and its profile; what the library says if it cannot be. The colour
-    stream may have any size."""
+    """A started pipeline and its profile, or what the library says. The colour stream may have any size."""
     pipeline, config = rs.pipeline(), rs.config()
     config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
     if color:

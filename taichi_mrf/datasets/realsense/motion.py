@@ -15,16 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.motion import (
-    AT_REST_S,
-    MOST_SAMPLES,
-    AccelerationSamples,
-    GyroSamples,
-    upwards_at,
-)
+from taichi_mrf.sensor.motion import AT_REST_S, MOST_SAMPLES, AccelerationSamples, GyroSamples, upwards_at
 
 LEAST_HZ = 100
-"""Of the rates that the camera offers the lowest from here on is taken."""
+"""Of the rates that the camera offers the lowest from here on is taken, else the highest."""
 
 WAIT_S = 1.0
 """The longest wait for accelerations around a camera's first image, and for a recording's next samples."""
@@ -141,12 +135,6 @@ def recorded_motion(rs: Any, path: Path) -> MotionModule:
     return module
 
 
-def _slowness(profile: Any) -> tuple[bool, int]:
-    """Sorts profiles: the lowest rate of at least LEAST_HZ first, then the highest below it."""
-    hz = profile.fps()
-    return hz < LEAST_HZ, abs(hz - LEAST_HZ)
-
-
 def _sensor_of(rs: Any, device: Any) -> tuple[Any, dict[Any, Any]]:
     """The sensor with the gyroscope, and its profiles of angular rates and, if it has any, accelerations."""
     for sensor in device.query_sensors():
@@ -154,7 +142,7 @@ def _sensor_of(rs: Any, device: Any) -> tuple[Any, dict[Any, Any]]:
         for kind in (rs.stream.gyro, rs.stream.accel):
             offered = [each for each in sensor.get_stream_profiles() if each.stream_type() == kind]
             if offered:
-                chosen[kind] = min(offered, key=_slowness)
+                chosen[kind] = min(offered, key=lambda p: (p.fps() < LEAST_HZ, abs(p.fps() - LEAST_HZ)))
         if rs.stream.gyro in chosen:
             return sensor, chosen
     raise LookupError("the camera has no gyroscope")

@@ -12,6 +12,7 @@ choose them.
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -54,7 +55,6 @@ from taichi_mrf.sensor.ray_table import RayTable
 REALSENSE = "/device_0/sensor_"
 """The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
 
-
 _AGREE = 0.03
 """Neighbouring images whose depths differ by less, as a share of them, agree."""
 
@@ -77,16 +77,13 @@ class RosBag(Table[BagRow]):
     acceleration: AccelerationSamples | None = None
 
     def check_scale(self, pose: Callable[[int], Pose] | None) -> list[str]:
-        """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
-        metres."""
+        """A note of whole numbers that are no measurements. Raises DatasetError if floats are no metres."""
         shares, depths = [], []
         for row in self.rows[:: -(-len(self.rows) // _LOOKED_AT)]:
-            try:
+            with suppress(DatasetError):  # reported when its frame is read
                 message = self.reader.read(self.topic, row.entry)
                 shares.append(messages.share_without(message))
                 depths.append(messages.depth_image(message, None))
-            except DatasetError:  # reported when its frame is read
-                continue
         if self.depth_scale is None:
             check_metres(depths, f"{self.reader.path}: topic {self.topic}")
         return note_of_largest(shares)
@@ -150,12 +147,9 @@ def _turned(poses: BagPoses) -> BagPoses:
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """Open a bag with the options after the question mark of its name.
-
-    Raises DatasetError, whose text names the file and where it applies the topic, for a bag that cannot be
-    read, missing or ambiguous topics, an unknown camera, and if no image has a
-    pose.
-    """
+    """Open a bag with the options after the question mark of its name. Raises DatasetError, which names the
+    file and where it applies the topic, for a bag that cannot be read, missing or ambiguous topics, an
+    unknown camera, and if no image has a pose."""
     chosen = parse_options(SensorChoice, query, str(path))
     if options.track:
         chosen = replace(chosen, poses=TRACK)
@@ -253,12 +247,9 @@ def _rows(reader: RosReader, posed: Sequence[tuple[int, Entry, Pose]]) -> list[B
 
 @dataclass(frozen=True)
 class BagSummary:
-    """The contents of a bag.
-
-    ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the tree's edges
-    in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to add; the first
-    needs the least to be filled in.
-    """
+    """The contents of a bag. ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the
+    tree's edges in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to
+    add; the first needs the least to be filled in."""
 
     topics: Sequence[Topic]
     remarks: dict[str, str]
@@ -273,7 +264,7 @@ class BagSummary:
 
 
 def summarise(path: Path) -> BagSummary:
-    """Look into a bag. Raises DatasetError, whose text names the file, if it cannot be read."""
+    """Look into a bag. Raises DatasetError, which names the file, if it cannot be read."""
     reader = RosReader(path)
     try:
         return summary_of(reader)

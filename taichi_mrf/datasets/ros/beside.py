@@ -20,7 +20,6 @@ from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.sensor import BagSensor, camera_of
 from taichi_mrf.datasets.ros.sources import Entry, TopicSource
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics, topics_of
@@ -128,7 +127,6 @@ def _grades(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""
-
 
 ImuRow = tuple[float, ...]
 """A measurement of an IMU in its own frame: stamp in seconds, angular rates, accelerations (7 numbers)."""
@@ -276,7 +274,7 @@ def _own_camera(
             return None, ()
         return f"its images have the depth camera's frame and another size, {width} x {height}"
     infos = [reader.first(name) for name in topic.info]
-    own_infos = [info for info in infos if info and frame_name(info.header.frame_id) == topic.frame]
+    own_infos = [info for info in infos if info and messages.frame_name(info.header.frame_id) == topic.frame]
     if not own_infos:
         return "its CameraInfo is not known"
     try:

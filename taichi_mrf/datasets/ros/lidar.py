@@ -136,10 +136,7 @@ _NEIGHBOURS = 1.5
 def organised(points_m: NDArray[np.floating]) -> tuple[Scan, NDArray[np.intp]] | None:
     """The image of points (H, W, 3) in the sensor's frame, where pixels without a point got nothing back, and
     the number, row by row, of each pixel's point, (H, W). None if neighbours in the image are no neighbours
-    in space.
-
-    Rows that are ahead of others by whole columns, as some drivers write them, are shifted back.
-    """
+    in space. Rows that are ahead of others by whole columns, as some drivers write them, are shifted back."""
     height, width = points_m.shape[:2]
     measured = measured_points(points_m)
     if min(height, width) < 2 or measured.mean() < _LEAST_MEASURED:
@@ -255,8 +252,7 @@ class LidarBag(LidarRecording, Table[BagRow]):
         return self.clouds.frame(row.entry, message, T_world_camera, row.stamp, row.name)
 
     def look_at_first(self, what: str = "cloud") -> None:
-        """Set camera, reach and a note from the first cloud that can be read. Raises DatasetError as for any
-        lidar."""
+        """Set camera, reach and a note from the first cloud that can be read. Raises as for any lidar."""
         super().look_at_first(what)
         self.notes.append(self.clouds.in_words(self.camera))
         if self.clouds.registered:
@@ -339,7 +335,7 @@ def find_clouds(
     reader: TopicSource, choice: SensorChoice, options: ReadOptions
 ) -> tuple[BagSensor, dict[str, BagPoses], Clouds]:
     """The point clouds that are mapped, as the user chose, else the only ones, their poses by frames, and how
-    they become frames. Raises DatasetError, whose text names the source and lists the candidates."""
+    they become frames. Raises DatasetError, which names the source and lists the candidates."""
     refuse_image_options(f"{reader.path}", options)
     topic = choose(reader, "points", choice.points, cloud_topics(reader), "topics of point clouds")
     if reader.topics[topic].type != messages.POINT_CLOUD:

@@ -102,10 +102,8 @@ def is_depth(encoding: str, topic: str) -> bool:
 
 def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, of an Image or a CompressedImage; 0 means no measurement.
-
     ``depth_scale`` (steps per metre) takes the place of the encoding's own. Raises DatasetError, which does
-    not name the topic, for a wrong encoding and for data that do not fit it.
-    """
+    not name the topic, for a wrong encoding and for data that do not fit it."""
     values, steps = _compressed(message) if hasattr(message, "format") else _raw(message)
     values = measured(values) if values.dtype.kind in "ui" else values
     depth_m = values.astype(np.float32) / np.float32(depth_scale or steps)
@@ -194,8 +192,7 @@ def grey_image(message: Any) -> NDArray[np.uint8]:
 
 
 def pose_of(message: Any) -> Pose:
-    """T_parent_child, (4, 4), of a message of one of the types POSES. Raises KeyframeError if it is no
-    pose."""
+    """T_parent_child, (4, 4), of a message of a type of POSES. Raises KeyframeError if it is no pose."""
     if hasattr(message, "transform"):
         return _pose(message.transform.translation, message.transform.rotation)
     pose = message.pose

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from taichi_mrf.datasets.options import parse_options
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import PATH
 from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_connect, pose_candidates
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
@@ -67,8 +66,7 @@ class PoseHistory:
 
 def open_history(path: Path, query: str) -> PoseHistory:
     """The poses that a bag tells, chosen by options after the question mark: ``pose``, ``body``, ``optical``,
-    ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, which names the file
-    and the topic."""
+    ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, naming file and topic."""
     choice = parse_options(PoseChoice, query, str(path))
     if choice.poses:
         raise DatasetError(f"{path}: ?poses= does not go with --poses; ?pose= names a topic, or tf")
@@ -97,7 +95,7 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
     if name == FROM_TF:
         return _from_tree(reader, tree, optical, choice)
     name = choose(reader, "pose", name, paths, "topics of poses")
-    if reader.topics[name].type == PATH:
+    if reader.topics[name].type == messages.PATH:
         return _from_paths(reader, name, tree, optical, choice, run)
     return _from_poses(reader, name, optical, choice, tree, run)
 
@@ -132,12 +130,8 @@ def _from_paths(
             T_body_optical = tree.lookup(body, optical, stamp, INTERPOLATION_GAP)
             if T_body_optical is None:
                 continue
-            try:
+            with naming(f"{reader.path}: topic {topic}: the pose at {stamp:.3f} s", KeyframeError):
                 found[stamp] = as_pose(messages.pose_of(each)) @ T_body_optical
-            except KeyframeError as error:
-                raise DatasetError(
-                    f"{reader.path}: topic {topic}: the pose at {stamp:.3f} s: {error}"
-                ) from error
         return found
 
     return PoseHistory(f"{reader.path}: {topic}", [entry.stamp for entry in entries], version)

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, Topic, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
@@ -36,7 +35,6 @@ NO_POSES = (
     "lines of stamp tx ty tz qx qy qz qw from a tracker or SLAM, or ?poses=track, which finds them from the "
     "images"
 )
-
 
 KEPT_S = 10.0
 """Poses of a robot that runs are kept for so many seconds."""
@@ -141,11 +139,8 @@ def find_poses(
     run: BagRun | None = None,
 ) -> BagPoses:
     """The poses of the sensor whose messages are in ``frame``, as the user chose, else from the only source
-    in the bag; ``read`` gives its tree of frames.
-
-    Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
-    or several, or if the named frames are not connected.
-    """
+    in the bag; ``read`` gives its tree of frames. Raises DatasetError, which names the file and lists the
+    candidates or the frames, if there are none or several, or if the named frames are not connected."""
     if choice.poses == TRACK:
         return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
     if choice.poses:
@@ -271,7 +266,8 @@ def _from_topic(
 
     def hear(topic: Topic, entry: Entry, message: Any) -> None:
         hear_tf(topic, entry, message)
-        if topic.name == name and _is_of(entry, message, parent, child):
+        of = messages.frame_name(getattr(message, "child_frame_id", ""))
+        if topic.name == name and entry.frame in ("", parent) and of in ("", child):
             pose = _valid_pose(message)
             if pose is not None:
                 timed.add(entry.stamp, pose, KEPT_S)
@@ -288,11 +284,6 @@ def _from_topic(
         hear=hear,
         moving=moving,
     )
-
-
-def _is_of(entry: Entry, message: Any, parent: str, child: str) -> bool:
-    """True if a pose is of a body in a frame, or does not say otherwise."""
-    return entry.frame in ("", parent) and frame_name(getattr(message, "child_frame_id", "")) in ("", child)
 
 
 def _valid_pose(message: Any) -> Pose | None:
@@ -320,8 +311,8 @@ def _read_poses(
         if pose is None:
             broken += 1
             continue
-        child = frame_name(getattr(message, "child_frame_id", ""))
-        if topic.type != messages.PATH and not header_ns(message.header):
+        child = messages.frame_name(getattr(message, "child_frame_id", ""))
+        if topic.type != messages.PATH and not messages.header_ns(message.header):
             unstamped.add(entry)
         sent.setdefault((entry.frame, child), []).append((entry, pose))
     if not sent:
@@ -356,8 +347,8 @@ def _of_path(reader: TopicSource, name: str) -> Iterator[tuple[Entry, Any]]:
     """The poses of the last message of a Path, which has all of them."""
     for entry, message in deque(reader.messages(name), maxlen=1):
         for i, each in enumerate(message.poses):
-            stamp = header_ns(each.header) / NANOSECONDS or entry.stamp
-            frame = frame_name(each.header.frame_id) or entry.frame
+            stamp = messages.header_ns(each.header) / NANOSECONDS or entry.stamp
+            frame = messages.frame_name(each.header.frame_id) or entry.frame
             yield replace(entry, ordinal=i, stamp=stamp, frame=frame), each
 
 
@@ -367,8 +358,7 @@ Sent = list[tuple[Entry, Pose]]
 def _one_body(
     where: str, sent: dict[tuple[str, str], Sent], choice: PoseChoice
 ) -> tuple[tuple[str, str], Sent]:
-    """The poses of one body in one frame, and the two; messages that name neither are of the only ones that
-    others name."""
+    """The poses of one body in one frame, and the two; messages without these are of the only ones named."""
     parents, children = ({pair[i] for pair in sent if pair[i]} for i in (0, 1))
     for named, wanted, option in ((parents, choice.frame, "frame"), (children, choice.body, "body")):
         if len(named) > 1:

@@ -96,8 +96,7 @@ def _sum_first(opens: Callable[[Any], None], sizes: Callable[[Any], Iterable[int
 
 
 def _held_to_sizes(reader: Any) -> Iterator[int]:
-    """The sizes of a ROS 1 bag's chunks by their headers, which rosbags passes over; the unpackers keep to
-    them."""
+    """The sizes of a ROS 1 bag's chunks by headers that rosbags passes over; the unpackers keep to them."""
     ros1 = importlib.import_module("rosbags.rosbag1.reader")
     for place, chunk in reader.chunks.items():
         reader.bio.seek(place)
@@ -152,8 +151,7 @@ def _channel_of(connection: Any, is2: bool) -> Channel:
 
 
 def msgtype_of(connection: Any) -> str:
-    """The type of a connection's messages as ROS 2 writes it; in an MCAP file converted from ROS 1 it is
-    written in another way."""
+    """The type of a connection's messages as ROS 2 writes it, also in an MCAP file converted from ROS 1."""
     is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1
     return ros2_name(connection.msgtype) if is_ros1 else connection.msgtype
 
@@ -243,11 +241,8 @@ class RosReader(TopicSource):
 
     def __init__(self, path: Path) -> None:
         """Open a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or one with the files of a recording
-        that was split.
-
-        Raises DatasetError, whose text names the file, if it is cut short, damaged or of a kind that is not
-        known, if files do not follow each other in time, and if rosbags is not installed.
-        """
+        that was split. Raises DatasetError, which names the file, if it is cut short, damaged or of a kind
+        that is not known, if files do not follow each other in time, and if rosbags is not installed."""
         self.path, self.parts = path, parts_of(path)
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):
@@ -287,7 +282,6 @@ class RosReader(TopicSource):
             self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
-        """In the order of recording."""
         previous, ordinal = None, 0
         places = self.places(topic) if self.by_file else []
         for number, (recorded_ns, message, publisher) in enumerate(self._read(topic, None, None)):
@@ -297,15 +291,12 @@ class RosReader(TopicSource):
             yield entry_of(message, recorded_ns, ordinal, publisher, place), message
 
     def places(self, topic: str) -> list[Place]:
-        """The places in the file of a topic's messages, in the order of ``messages``; none if its index is
-        damaged."""
         try:
             return places_of(self._reader.readers, topic, self.topics[topic].type)
         except Exception:  # as on opening
             return []
 
     def read(self, topic: str, entry: Entry) -> Any:
-        """One message again. Raises DatasetError, which names file and topic."""
         found = self._read(topic, entry.recorded_ns, entry.recorded_ns + 1)
         for ordinal, (_, message, _) in enumerate(found):
             if ordinal == entry.ordinal:

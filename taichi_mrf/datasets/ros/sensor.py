@@ -1,5 +1,4 @@
-"""The messages of a bag's sensor that are mapped, their poses, and the cameras that took them, out of a
-CameraInfo."""
+"""The messages of a bag's sensor that are mapped, their poses, and their cameras, out of a CameraInfo."""
 
 from bisect import bisect_right
 from collections import Counter
@@ -180,8 +179,8 @@ class DepthCamera(NamedTuple):
 
 
 def find_depth_camera(reader: TopicSource, choice: SensorChoice, options: ReadOptions) -> DepthCamera:
-    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, whose
-    text names the source and lists the candidates."""
+    """The depth images that are mapped, as the user chose, else the only ones. Raises DatasetError, which
+    names the source and lists the candidates."""
     depth = choose_depth(reader, choice.depth)
     sensor = find_sensor(reader, depth.name, "images", choice)
     cameras = find_cameras(sensor, depth, choice.info, options)
@@ -296,11 +295,12 @@ class BagCameras:
 
 def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:
     """The cameras of a topic's images, given by the user or by CameraInfo on the topic ``wanted`` or the only
-    one that fits. Raises DatasetError, which names file, topic and remedy, if they are not known or do not
-    fit the images."""
+    one that fits. Raises DatasetError, which names file, topic and remedy, if none is known or fits."""
     reader, entries, given = sensor.reader, sensor.entries, options.camera
     if options.intrinsics is not None and given is None:
-        given = PinholeCamera(*_first_size(reader, depth), *options.intrinsics)
+        with naming(f"{reader.path}: topic {depth.name}"):
+            height, width = messages.depth_image(reader.first(depth.name), None).shape
+        given = PinholeCamera(width, height, *options.intrinsics)
     if given is not None:
         return BagCameras({"": [(0.0, StatedCamera(given, given))]}, given)
     if not (wanted or depth.info):
@@ -428,20 +428,10 @@ def _fitted(
     return cameras
 
 
-def _first_size(reader: TopicSource, depth: DepthTopic) -> tuple[int, int]:
-    """(width, height) of a topic's first image."""
-    with naming(f"{reader.path}: topic {depth.name}"):
-        height, width = messages.depth_image(reader.first(depth.name), None).shape
-    return width, height
-
-
 def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ...]]:
-    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
-
-    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
-    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
-    OpenCV's.
-    """
+    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none. Images that are
+    ``rectified`` are those of the projection P, and have no distortion left. Raises DatasetError, which does
+    not name the topic, if it is not calibrated, or has a lens model that is not OpenCV's."""
     K, D, P = (_field(info, name) for name in "kdp")
     matrix, projection = K.reshape(3, 3), P.reshape(3, 4)[:, :3]
     # Drivers without a calibration leave K at zero or the identity, and some of them fill P alone.
@@ -458,11 +448,9 @@ def camera_of(info: Any, rectified: bool) -> tuple[StatedCamera, tuple[float, ..
             f"says that images have {info.width} x {info.height} pixels, so nothing tells whether its "
             f"intrinsics are theirs; --camera {k} takes them"
         )
-    try:
+    with naming("", ConfigError):
         full = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
         camera = StatedCamera(full, _cut(full, info))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
     if rectified or not D.any():
         return camera, ()
     if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:

@@ -25,11 +25,9 @@ def mended_stamps(
     recorded_s: Sequence[float], stamps_s: Sequence[float], repeated: Sequence[bool] = ()
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Stamps (N,) of messages in the order of recording, and which of them were wrong, (N,): 0, ``repeated``
-    long after, or out of the order of their neighbours by more than a clock's restart.
-
-    In place of a wrong one is the time of recording, less the usual delay of the messages around it; NaN
-    where that varies by more than half the time between two messages. None is wrong where nearly all are 0.
-    """
+    long after, or out of the order of their neighbours by more than a clock's restart. In place of a wrong
+    one is the time of recording, less the usual delay of the messages around it; NaN where that varies by
+    more than half the time between two messages. None is wrong where nearly all are 0."""
     recorded, s = np.asarray(recorded_s, np.float64), np.asarray(stamps_s, np.float64)
     wrong = s == 0
     good = np.flatnonzero(~wrong)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sources import NANOSECONDS, Entry, TopicSource
 from taichi_mrf.datasets.ros.stamps import mended_stamps
@@ -26,7 +25,6 @@ from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 
 Edge = Pose | TimedPoses
 """T_parent_child, (4, 4), or such poses with stamps."""
-
 
 WORLDS = ("map", "odom", "world", "earth", "utm")
 """Frames that are fixed by their names (REP 105), and no body."""
@@ -229,16 +227,11 @@ Transforms = dict[str, list[_Sent]]
 
 
 def tree_of(
-    sent: dict[str, Transforms],
-    topic: str,
-    frame: str,
-    tf: str = "",
-    run: BagRun | None = None,
+    sent: dict[str, Transforms], topic: str, frame: str, tf: str = "", run: BagRun | None = None
 ) -> TransformTree:
     """The tree of frames of the sensor whose messages are on ``topic`` and in ``frame``. Transforms on a
     topic called tf_static are fixed; the last message counts. ``tf`` is the option of that name. Raises
-    DatasetError, which does not name the file, if several trees may be the sensor's, or if ``tf`` names
-    nothing."""
+    DatasetError, which does not name the file, if several trees may be its own, or ``tf`` names none."""
     publishers = sorted(
         {each.publisher for all_ in sent.values() for some in all_.values() for each in some} - {""}
     )
@@ -292,7 +285,7 @@ def _sent_in(topic: str, entry: Entry, message: Any) -> Iterator[tuple[str, _Sen
     """The transforms in a message, by the frames that they are of."""
     is_static = topic.endswith("tf_static")
     for each in message.transforms:
-        parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+        parent, child = messages.frame_name(each.header.frame_id), messages.frame_name(each.child_frame_id)
         try:
             pose = as_pose(messages.pose_of(each))
         except KeyframeError:

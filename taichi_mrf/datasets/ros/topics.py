@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.sources import TopicSource
 from taichi_mrf.errors import DatasetError, naming
 
@@ -19,8 +18,7 @@ FROM_TF = "tf"
 
 @dataclass(frozen=True)
 class DepthTopic:
-    """A topic of depth images: their encoding, their camera's frame, and the CameraInfo topics that may be
-    its."""
+    """A topic of depth images: encoding, their camera's frame, and the CameraInfo topics that may be its."""
 
     name: str
     encoding: str
@@ -81,7 +79,7 @@ def cloud_topics(reader: TopicSource) -> list[str]:
 def message_frame(reader: TopicSource, topic: str) -> str:
     """The coordinate frame of a topic's first message, empty if there is none."""
     message = reader.first(topic)
-    return "" if message is None else frame_name(message.header.frame_id)
+    return "" if message is None else messages.frame_name(message.header.frame_id)
 
 
 def described(reader: TopicSource, name: str) -> DepthTopic:
@@ -93,7 +91,7 @@ def described(reader: TopicSource, name: str) -> DepthTopic:
     message = reader.first(name)
     if message is None:
         raise DatasetError(f"{reader.path}: topic {name} contains no message")
-    frame = frame_name(message.header.frame_id)
+    frame = messages.frame_name(message.header.frame_id)
     return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name, frame))
 
 
@@ -114,11 +112,9 @@ def _shared_parts(a: str, b: str) -> int:
 
 
 def choose(reader: TopicSource, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
-    """The topic that the user named, or the only candidate.
-
-    Raises DatasetError, whose text names the file and lists the candidates, if the bag has no topic of that
-    name, if there are several candidates and none was named, or no candidate.
-    """
+    """The topic that the user named, or the only candidate. Raises DatasetError, which names the file and
+    lists the candidates, if the bag has no topic of that name, if there are several candidates and none was
+    named, or no candidate."""
     path = reader.path
     if wanted:
         name = wanted if wanted in reader.topics else f"/{wanted}"

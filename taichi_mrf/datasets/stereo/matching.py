@@ -126,8 +126,7 @@ class StereoRig:
     """Distance of the two cameras in metres."""
 
     def __post_init__(self) -> None:
-        ok = math.isfinite(self.baseline_m) and self.baseline_m > 0
-        if not ok:
+        if not 0 < self.baseline_m < math.inf:
             raise ConfigError(f"stereo baseline_m must be a positive number of metres, not {self.baseline_m}")
 
     def depth(self, disparity_px: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -156,11 +155,9 @@ class StereoRig:
 
 def depth_sigma(sigma_d_px: float, baseline_m: float, fx: float) -> tuple[float, float, float]:
     """Coefficients (0, 0, lambda) of the standard deviation of depth, ascending powers of depth in metres.
-
     lambda = sigma_d / (b f) (Schauwecker and Zell, eq. 7), for the standard deviation of the disparity in
     pixels, the baseline in metres and the focal length in pixels. They are what ``PolynomialNoise`` and
-    ``sensor.sigma`` take. Raises ConfigError if one of the three is not positive.
-    """
+    ``sensor.sigma`` take. Raises ConfigError if one of the three is not positive."""
     for name, value in (("sigma_d_px", sigma_d_px), ("baseline_m", baseline_m), ("fx", fx)):
         if not (math.isfinite(value) and value > 0):
             raise ConfigError(f"stereo {name} must be a positive number, not {value}")
@@ -170,10 +167,8 @@ def depth_sigma(sigma_d_px: float, baseline_m: float, fx: float) -> tuple[float,
 def stereo_depth(
     left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig, matching: StereoMatching | None = None
 ) -> NDArray[np.float32]:
-    """Axial depth of the left camera, (H, W) float32 in metres, 0 = none, from a rectified grey pair.
-
-    Raises FrameError as :func:`stereo_disparity` does, and if the pair is not of the camera's size.
-    """
+    """Axial depth of the left camera, (H, W) float32 in metres, 0 = none, from a rectified grey pair. Raises
+    FrameError as :func:`stereo_disparity` does, and if the pair is not of the camera's size."""
     disparity_px = stereo_disparity(left, right, matching)
     if disparity_px.shape != rig.camera.shape:
         raise FrameError(
@@ -187,11 +182,9 @@ def stereo_disparity(
     left: NDArray[np.uint8], right: NDArray[np.uint8], matching: StereoMatching | None = None
 ) -> NDArray[np.float32]:
     """Disparity of each pixel of the left image, (H, W) float32 in pixels, 0 = none; the images are grey.
-
     Both images are matched, each with the other: OpenCV's own check (disp12MaxDiff) only looks for pixels
     that claim one partner, within one matching, and alone leaves twice the gross errors on street scenes.
-    Raises FrameError if the images are not grey, not 8-bit, not of one size, or narrower than a block.
-    """
+    Raises FrameError if the images are not grey, not 8-bit, not of one size, or narrower than a block."""
     settings = matching or StereoMatching()
     for side, image in (("left", left), ("right", right)):
         if image.ndim != 2 or image.dtype != np.uint8 or image.size == 0:
@@ -215,11 +208,9 @@ def stereo_disparity(
 def left_right_consistent(
     left_px: NDArray[np.floating], right_px: NDArray[np.floating], tolerance_px: float
 ) -> NDArray[np.bool_]:
-    """Which pixels of the left disparity image the right one confirms, (H, W); 0 = none in both.
-
-    A pixel at column u with disparity d is confirmed if column u - d (rounded) of the right image exists
-    and has a disparity within ``tolerance_px`` of d.
-    """
+    """Which pixels of the left disparity image the right one confirms, (H, W); 0 = none in both. A pixel at
+    column u with disparity d is confirmed if column u - d (rounded) of the right image exists and has a
+    disparity within ``tolerance_px`` of d."""
     rows, columns = np.indices(left_px.shape)
     partner = np.rint(columns - left_px).astype(np.int64)
     inside = (left_px > 0) & (partner >= 0)
@@ -286,10 +277,8 @@ SPREAD_RANGE_PX = (0.06, 3.0)
 def disparity_sigma(
     left: NDArray[np.uint8], right: NDArray[np.uint8], disparity_px: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Standard deviation of each pixel's disparity, (H, W) float32 in pixels, 0 where there is none.
-
-    ``left`` and ``right`` are the grey pair, (H, W), ``disparity_px`` that of the left image, 0 = none.
-    """
+    """Standard deviation of each pixel's disparity, (H, W) float32 in pixels, 0 where there is none. ``left``
+    and ``right`` are the grey pair, (H, W), ``disparity_px`` that of the left image, 0 = none."""
     before, here, behind = (_cost(left, right, disparity_px, shift) for shift in (-1.0, 0.0, 1.0))
     curvature = np.maximum(before + behind - 2 * here, np.float32(1e-6))
     move = np.clip(np.sqrt(here / curvature), *MOVE_RANGE_PX)
@@ -319,8 +308,7 @@ def _spread(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
     block = np.ones((BLOCK, BLOCK), np.uint8)
     nearest = cv2.dilate(disparity_px, block)
     farthest = cv2.erode(np.where(disparity_px > 0, disparity_px, np.float32(1e4)), block)
-    spread: NDArray[np.float32] = nearest - farthest
-    return spread
+    return nearest - farthest
 
 
 @dataclass(frozen=True)
@@ -333,10 +321,8 @@ class RecordedPair(Row):
 
 @dataclass
 class StereoPairs(Table[RecordedPair]):
-    """Stereo pairs as depth frames of the left camera; ``color`` is the left image.
-
-    ``matching`` may be set to other parameters before frames are read.
-    """
+    """Stereo pairs as depth frames of the left camera; ``color`` is the left image. ``matching`` may be set
+    to other parameters before frames are read."""
 
     camera: PinholeCamera
     baseline_m: float = 1.0

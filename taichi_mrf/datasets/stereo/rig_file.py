@@ -2,14 +2,10 @@
 
 ::
 
-    fx: 707.1            # pixels; fy is fx unless it is given
-    cx: 601.9
-    cy: 183.1
-    baseline: 0.537      # metres
-    left: cam0/*.png     # relative to this file, paired in the order of their names
-    right: cam1/*.png
-    poses: poses.txt     # T_world_camera of the left camera, in any layout that trajectories have
-    times: times.txt     # optional: a stamp in seconds for each pair
+fx: 707.1 # pixels; fy is fx unless it is given cx: 601.9 cy: 183.1 baseline: 0.537 # metres left: cam0/*.png
+# relative to this file, paired in the order of their names right: cam1/*.png poses: poses.txt #
+T_world_camera of the left camera, in any layout that trajectories have times: times.txt # optional: a stamp
+in seconds for each pair
 
 Poses with stamps are interpolated at the pairs' own: those of ``times``, else the images' names as seconds,
 or as nanoseconds if they are whole numbers of 16 digits or more. Other poses go with the pairs in their
@@ -81,7 +77,7 @@ class RigFile:
 
 
 def open_file(path: Path, options: ReadOptions) -> Dataset:
-    """List the pairs of a description. Raises DatasetError, whose text names the file and the field."""
+    """List the pairs of a description. Raises DatasetError, which names the file and the field."""
     described, folder = _read(path), path.parent
     if options.depth_scale is not None:
         raise DatasetError(f"{path}: takes no depth_scale: depth comes from stereo pairs")
@@ -106,15 +102,13 @@ def open_file(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _read(path: Path) -> RigFile:
-    try:
+    with naming("", ConfigError):
         values = read_yaml(path)
         for known in fields(RigFile):
             needed = known.default is MISSING and known.default_factory is MISSING
             if needed and isinstance(values, dict) and known.name not in values:
                 raise DatasetError(f"{path}: {known.name} is missing in this description of stereo pairs")
         return from_dict(RigFile, values if isinstance(values, dict) else str(values), str(path))
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
 
 
 def _images(path: Path, side: str, pattern: str) -> list[Path]:

@@ -19,10 +19,7 @@ def render(
     scene: Scene, camera: PinholeCamera, T_world_camera: Pose, color: bool = True
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
     """Axial depth, (H, W) float32 in metres, 0 where a ray meets nothing, and a shaded picture, (H, W, 3)
-    uint8 RGB, or None without ``color``.
-
-    Taichi has to run, and the camera has to be outside of every solid.
-    """
+    uint8 RGB, or None without ``color``. Taichi has to run, and the camera to be outside of all solids."""
     depth_m = np.zeros(camera.shape, dtype=np.float32)
     shaded = np.zeros((*camera.shape, 3) if color else (1, 1, 3), dtype=np.float32)
     # A colour picture needs all solids: those that are not in the picture throw shadows into it.
@@ -43,7 +40,7 @@ def render(
 
 def ray_depths(scene: Scene, camera: Camera, T_world_camera: Pose) -> NDArray[np.float32]:
     """Depth along the rays of any camera, (H, W) float32 in metres (range for a lidar), 0 where a ray meets
-    nothing. As for :func:`render`, Taichi has to run, and the camera has to be outside of every solid."""
+    nothing. As for :func:`render`, Taichi has to run, and the camera to be outside of all solids."""
     directions = camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T
     depth_m = np.zeros(len(directions), dtype=np.float32)
     origins = origins_of(camera)

@@ -65,11 +65,9 @@ class Scene:
         return np.array([(*s.color, s.checker) for s in self.solids], dtype=np.float32)
 
     def signed_distance(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Distance to the nearest surface, (N,) in metres, of points (N, 3); negative inside a solid.
-
-        Outside it is exact. Inside, where solids overlap, the true distance to the free space may be
-        larger in size (the minimum over solids is a bound), but the sign is always right.
-        """
+        """Distance to the nearest surface, (N,) in metres, of points (N, 3); negative inside a solid. Outside
+        it is exact. Inside, where solids overlap, the true distance to the free space may be larger in size
+        (the minimum over solids is a bound), but the sign is always right."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         nearest = np.full(len(points), np.inf)
         for radius, solid in sorted(((ball_radius(s), s) for s in self.solids), key=lambda pair: -pair[0]):

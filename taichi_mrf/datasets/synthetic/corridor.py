@@ -114,11 +114,6 @@ def corridor_length(rooms: int) -> float:
     return -(-rooms // 2) * PITCH
 
 
-def floor_area_m2(rooms: int) -> float:
-    """Floor of the corridor and its rooms, without walls."""
-    return 2 * HALF_WIDTH * corridor_length(rooms) + rooms * LENGTH * WIDTH
-
-
 def corridor_scene(rooms: int) -> Scene:
     """The corridor with its rooms in the world frame."""
     solids = _shell(rooms)
@@ -229,8 +224,6 @@ def pose_on_path(path: NDArray[np.float64], phase: float) -> Pose:
 STEP_M = 0.02
 """Between neighbouring points of the path."""
 
-EYE_M = 1.5
-
 
 class SmoothPath:
     """The path past some corners, (n, 2) in metres, over a floor at ``floor_z``."""
@@ -253,7 +246,7 @@ class SmoothPath:
         self._places = kept
         self._headings = heading
         self._reached = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(kept, axis=0), axis=1))])
-        self._eye_z = floor_z + EYE_M
+        self._eye_z = floor_z + EYE
 
     @property
     def length_m(self) -> float:
@@ -388,11 +381,9 @@ LAMP_OVER_EYE_M = 0.6
 
 @dataclass
 class Walked(RenderedSequence):
-    """A walk as a sequence of frames, from its beginning to its end, in the light of a lamp over the
-    camera."""
+    """A walk as a sequence of frames, from beginning to end, in the light of a lamp over the camera."""
 
     def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:
-        """A scene in the light of the lamp."""
         x, y, z = T_world_camera[:3, 3].tolist()
         return replace(scene, light=(x, y, z + LAMP_OVER_EYE_M))
 
@@ -420,7 +411,6 @@ class SyntheticCorridor(Walked):
 
     @cached_property
     def scene(self) -> Scene:
-        """The corridor and its rooms, in the world frame."""
         return corridor_scene(self.options.rooms)
 
     @cached_property
@@ -428,7 +418,6 @@ class SyntheticCorridor(Walked):
         return waypoints(self.options.rooms)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         return pose_on_path(self._camera_path, index / max(1, self.options.frames - 1))
 
 
@@ -458,7 +447,6 @@ class SyntheticRing(Walked):
 
     @cached_property
     def scene(self) -> Scene:
-        """The corridor in the world frame."""
         return ring_scene(self.options.length, bare=self.options.walls == "bare")
 
     @cached_property
@@ -467,7 +455,6 @@ class SyntheticRing(Walked):
         return ring_path(self.options.length)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         return self.camera_path.pose_at(self.camera_path.length_m * index / max(1, self.options.frames - 1))
 
 

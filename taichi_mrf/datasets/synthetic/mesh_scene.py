@@ -6,12 +6,11 @@ with the extra ``mesh``. World frame, metres.
 The surfaces of an analytic scene can be such a mesh. Solids may overlap, so there are triangles inside of
 other solids too; no camera sees them.
 
-
 ``mesh:FILE?poses=FILE``: a triangle mesh seen from recorded poses, with the truth and a simulated sensor.
 
 More options follow after ``&``, as in ``mesh:house.ply?poses=T_world_camera.txt&noise=kinect&seed=1``; the
-fields of :class:`MeshOptions` are the options. The mesh's frame is the world; their file
-is in any layout that recordings use (trajectories.py). Paths are relative to the working folder.
+fields of :class:`MeshOptions` are the options. The mesh's frame is the world; their file is in any layout
+that recordings use (trajectories.py). Paths are relative to the working folder.
 """
 
 import math
@@ -105,11 +104,9 @@ class MeshScene:
 
 
 def load_mesh(path: Path) -> TriangleMesh:
-    """Read a triangle mesh from a PLY, OBJ, STL, OFF or glTF file, its parts joined into one.
-
-    Raises DatasetError, whose text names the file, if trimesh is not installed, if the file is missing or
-    cannot be read as a mesh, and for a mesh without triangles or with vertices that are not finite.
-    """
+    """Read a triangle mesh from a PLY, OBJ, STL, OFF or glTF file, its parts joined into one. Raises
+    DatasetError, which names the file, if trimesh is not installed, if the file is missing or cannot be read
+    as a mesh, and for a mesh without triangles or with vertices that are not finite."""
     trimesh = _library("trimesh")
     if not is_file(path):
         raise DatasetError(f"{path}: {'is not a file' if exists(path) else 'the mesh is missing'}")
@@ -245,7 +242,6 @@ class MeshSequence(Table[Row]):
         return self.scene.render_depth(self.camera, self.pose(index))
 
     def load(self, index: int, row: Row, T_world_camera: Pose) -> Frame:
-        """Render one frame, with the noise that the options ask for."""
         depth_m = self.clean_depth(index)
         if self.options.noise != "none":
             sensor = SENSORS[self.options.noise]
@@ -254,12 +250,9 @@ class MeshSequence(Table[Row]):
 
 
 def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
-    """Open ``FILE?poses=FILE&...``, what follows ``mesh:`` in a source's name.
-
-    Raises DatasetError, whose text names the file or the option, for a mesh or a file of poses that cannot
-    be read, for a wrong option, for a depth scale, which rendered depth does not have, and if the
-    libraries that meshes need are not installed.
-    """
+    """Open ``FILE?poses=FILE&...``, what follows ``mesh:`` in a source's name. Raises DatasetError, which
+    names the file or the option, for a mesh or poses that cannot be read, a wrong option, a depth scale,
+    which rendered depth does not have, and if the libraries that meshes need are missing."""
     file, _, query = source.partition("?")
     name = f"{NAME}{file}"
     if not file:

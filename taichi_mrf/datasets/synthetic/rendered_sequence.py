@@ -113,10 +113,8 @@ class RenderOptions:
 
 @dataclass
 class RenderedSequence(Dataset):
-    """Pictures of a scene, with the truth beside them.
-
-    Reading a frame needs Taichi to run (:func:`taichi_mrf.init`), else BackendError.
-    """
+    """Pictures of a scene, with the truth beside them. Reading a frame needs Taichi to run
+    (:func:`taichi_mrf.init`), else BackendError."""
 
     camera: PinholeCamera
     options: RenderOptions = RenderOptions()
@@ -145,7 +143,6 @@ class RenderedSequence(Dataset):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """The names of the frames in order, for reports."""
         place = self.name.partition(":")[2]
         return [f"{place}-{index:04d}" for index in range(self.options.frames)]
 
@@ -155,7 +152,6 @@ class RenderedSequence(Dataset):
         return StatedSensor(reach_m=SensorConfig().max_depth)
 
     def pose(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4). Raises IndexError if there is no such frame."""
         if not 0 <= index < self.options.frames:
             raise IndexError(f"{self.name} has {self.options.frames} frames, there is no frame {index}")
         return self.pose_at(index)
@@ -170,7 +166,6 @@ class RenderedSequence(Dataset):
         return self.scene.signed_distance(points)
 
     def stamps(self) -> Sequence[float]:
-        """When each frame was taken, in seconds."""
         return [self.stamp_at(index) for index in range(self.options.frames)]
 
     def read(self, index: int) -> Frame:
@@ -200,11 +195,9 @@ AnySequence = TypeVar("AnySequence", bound=RenderedSequence)
 
 
 def open_scene(kind: type[AnySequence], name: str, query: str, options: ReadOptions) -> AnySequence:
-    """Open a built-in scene with the options after the question mark of its name.
-
-    Raises DatasetError for an option that does not exist (naming the nearest), a value of the wrong type or
-    out of range, and for a depth scale, which rendered depth does not have.
-    """
+    """Open a built-in scene with the options after the question mark of its name. Raises DatasetError for an
+    option that does not exist (naming the nearest), a value of the wrong type or out of range, and for a
+    depth scale, which rendered depth does not have."""
     if options.depth_scale is not None:
         raise DatasetError(f"{name}: takes no depth_scale: its depth is in metres")
     chosen = parse_options(type(kind.options), query, name)

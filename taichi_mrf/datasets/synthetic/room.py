@@ -314,14 +314,12 @@ def _person() -> tuple[Solid, ...]:
 SCRIPTS: dict[str, Callable[[int], MovingScene]] = {"things": _things, "door": _door, "walker": _walker}
 """The scripts by name, in the room's own frame; each takes a variant."""
 
-
 NAME = "synthetic:room"
 
 
 @dataclass(frozen=True)
 class RoomOptions(RenderOptions):
-    """The options of the built-in room. At 32 frames the camera takes 6.4 s for its
-    round."""
+    """The options of the built-in room. At 32 frames the camera takes 6.4 s for its round."""
 
     moving: Literal["none", "things", "door", "walker"] = "none"
     """Moving things: none; things that appear, leave and are moved; a door; or a person who walks through. If
@@ -348,15 +346,12 @@ class SyntheticRoom(RenderedSequence):
         return self.moving_scene.static if self.moving_scene else room_scene()
 
     def scene_at(self, index: int) -> Scene:
-        """All solids at the time of a frame."""
         return self.moving_scene.at(self.stamp_at(index)) if self.moving_scene else self.scene
 
     def stamp_at(self, index: int) -> float:
-        """The time of a frame in seconds."""
         return float(index) if self.moving_scene else super().stamp_at(index)
 
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4)."""
         if self.moving_scene:
             return self.moving_scene.camera.pose(self.stamp_at(index))
         return camera_pose(index / self.options.frames)

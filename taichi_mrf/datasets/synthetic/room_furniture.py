@@ -34,8 +34,7 @@ def room_scene() -> Scene:
 
 
 def room_solids(doorway: Sequence[Solid] = ()) -> list[Solid]:
-    """All solids in the room's own frame. ``doorway`` replaces the wall at the lowest y and the shut door in
-    it."""
+    """All solids in the room's own frame. ``doorway`` replaces the wall at the lowest y and its door."""
     return [
         *_shell(doorway or [_near_wall()]),
         *(() if doorway else _shut_door()),
@@ -98,10 +97,7 @@ def _shell(near_wall: Sequence[Solid]) -> list[Solid]:
 
 
 def _shut_door() -> list[Solid]:
-    return [
-        box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD),
-        sphere(1.85, -2.40, 1.05, 0.035, METAL),
-    ]
+    return [box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD), sphere(1.85, -2.40, 1.05, 0.035, METAL)]
 
 
 def _window_and_picture() -> list[Solid]:

@@ -64,12 +64,10 @@ class FoxgloveClient(Client):
             )
 
     def subscribe(self, topics: Collection[str]) -> None:
-        """Ask for the messages of these topics and of no others, also of those that are advertised later."""
         self._wanted = set(topics)
         self._ask()
 
     def close(self) -> None:
-        """End the connection."""
         self._ended.set()
         self._connection.close()
 

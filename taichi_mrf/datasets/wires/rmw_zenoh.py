@@ -227,10 +227,9 @@ class ZenohNode(_Node):
     def __init__(
         self, address: str, domain: int, types: Mapping[str, tuple[str, str]], came: Callable[[str], None]
     ) -> None:
-        """Connect as a node does, and publish on the topics of ``types``: name (nav_msgs/msg/Path) and
-        hash of each one's type. ``came`` is told, from another thread, of each topic that somebody has
-        subscribed to. Raises ConfigError, which names the address, if nobody answers there, and if Zenoh is
-        not installed."""
+        """Connect as a node does, and publish on the topics of ``types``: name (nav_msgs/msg/Path) and hash
+        of each one's type. ``came`` is told, from another thread, of each topic that somebody has subscribed
+        to. Raises ConfigError, naming the address, if nobody answers, and without Zenoh."""
         super().__init__(address, domain, ConfigError)
         ext, self._came = self._ext, came
         self._listeners: dict[str, str] = {}
@@ -281,8 +280,7 @@ def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
 
 
 def published_ns(attached: bytes) -> int | None:
-    """When a message was published, in nanoseconds, by what is attached to it; None if that has another
-    layout."""
+    """When a message was published, in nanoseconds, by what is attached; None in another layout."""
     if len(attached) != _ATTACHED.size:
         return None
     _, stamp_ns, count, _ = _ATTACHED.unpack(attached)

@@ -67,8 +67,7 @@ class ZenohChoice(SensorChoice):
 
 def _opened(wire: str, text: str, options: ReadOptions) -> Dataset:
     """Connect to a robot: ``ADDRESS?option=value&...``; over Zenoh the address may be missing. Raises
-    DatasetError, which names the address, if it cannot be reached, and as a bag does if it is not clear what
-    to map."""
+    DatasetError, naming the address, if it cannot be reached, and as a bag if it is not clear what to map."""
     heard, chosen = _connected(f"{wire}{text}")
     if options.track:
         chosen = replace(chosen, poses=TRACK)

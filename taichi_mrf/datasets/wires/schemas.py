@@ -26,9 +26,8 @@ _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 
 
 def decoder_of(channel: Channel) -> Callable[[bytes], Any]:
-    """What makes messages of ROS of a channel's bytes, of one of ROS_TYPES; it raises errors of many kinds
-    for damaged data. Raises errors of many kinds if the channel's descriptors are damaged, and TaichiMRFError
-    without protobuf's library."""
+    """What makes messages of ROS of a channel's bytes, of one of ROS_TYPES; for damaged data it raises errors
+    of many kinds, as this does for damaged descriptors, and TaichiMRFError without protobuf's library."""
     made = _MADE[channel.schema][1]
     if channel.encoding == JSON:
         return lambda data: made(json.loads(data))

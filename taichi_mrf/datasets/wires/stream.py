@@ -84,8 +84,7 @@ class Robot(Dataset):
 
     @abstractmethod
     def load(self, posed: Posed, stamp: float, name: str) -> Frame:
-        """The frame of a message, which gets a stamp and a name. Raises DatasetError, which names source and
-        topic."""
+        """The frame of a message, with a stamp and a name. Raises DatasetError, naming source and topic."""
 
     def until(self, entry: Entry, message: Any) -> float:
         """The time in seconds up to which poses are needed for a message."""
@@ -107,16 +106,13 @@ class Robot(Dataset):
 
     @property
     def endless(self) -> bool:
-        """A robot never ends."""
         return True
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """The numbers of messages."""
         return EndlessNames()
 
     def awaiting(self) -> str:
-        """Why there is no frame."""
         self._take(self.heard.hear())
         if self._next is not None:
             return ""
@@ -303,8 +299,7 @@ class CameraRobot(Robot):
         return posed._replace(beside=beside), is_whole
 
     def take_other(self, heard: Heard) -> None:
-        """Take images beside depth, what an IMU measured, and a CameraInfo, which may be another than
-        before."""
+        """Take images beside depth, what an IMU measured, and a CameraInfo, which may have changed."""
         if heard.topic.name in self._beside:
             self._beside[heard.topic.name].append(heard)
         elif self.imu is not None and heard.topic.name == self.imu.topic:
@@ -332,7 +327,6 @@ class LidarRobot(Robot, LidarRecording):
     clouds: Clouds = field(kw_only=True)
 
     def load(self, posed: Posed, stamp: float, name: str) -> Frame:
-        """Decode a cloud."""
         assert posed.pose is not None
         return self.clouds.frame(posed.heard.entry, posed.heard.message, posed.pose, stamp, name)
 
