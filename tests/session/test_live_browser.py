@@ -321,6 +321,7 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
 
 
+@pytest.mark.usefixtures("saved")  # which starts Taichi, with which the room is rendered
 def test_the_ray_of_a_pixel_is_that_of_its_measurement(page: LivePage) -> None:
     frame = open_dataset(ROOM).read(3)
     depth_m, camera = frame.depth_m, frame.camera
