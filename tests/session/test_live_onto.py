@@ -291,11 +291,11 @@ def test_a_robot_goes_on_in_the_map_once_it_is_located(
     days: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("foxglove", reason="needs foxglove-sdk")
-    from foxglove_robot import robot
+    from foxglove_robot import Robot
 
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     said: list[str] = []
-    with robot(write_bag(tmp_path, walk, kind="mcap")) as sender:
+    with Robot(write_bag(tmp_path, walk, kind="mcap")) as sender:
 
         def send() -> None:
             sender.wait_for("/camera/depth", "/tf", "/tf_static")

@@ -28,7 +28,7 @@ from taichi_mrf.viewer.messages import Notice, Request, Status, Update
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
-from foxglove_robot import Robot, robot
+from foxglove_robot import Robot
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -54,7 +54,7 @@ def sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     """A robot that has sent its first image when it is opened."""
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     monkeypatch.setenv("COLUMNS", "200")
-    with robot(write_bag(tmp_path, walk, kind="mcap")) as found:
+    with Robot(write_bag(tmp_path, walk, kind="mcap")) as found:
         thread = Thread(target=partial(begin, found))
         thread.start()
         yield found
@@ -127,7 +127,7 @@ def test_a_lidar_s_map_is_that_of_its_bag_bit_for_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
-    with robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
+    with Robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
 
         def send_first() -> None:
             sender.wait_for("/points", "/tf", "/tf_static")
@@ -200,7 +200,7 @@ def test_under_load_the_newest_image_is_mapped_at_its_own_pose(
                 done.wait((later - time) / 1e9 / 3)
 
     link = FakeLink(slow)
-    with robot(write_bag(tmp_path, around, kind="mcap")) as sender:
+    with Robot(write_bag(tmp_path, around, kind="mcap")) as sender:
         thread = Thread(target=send, args=[sender])
         thread.start()
         try:

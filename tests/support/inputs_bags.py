@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -257,6 +257,10 @@ def steps(i: int) -> np.ndarray:
     return image
 
 
+def metres(i: int) -> np.ndarray:
+    return steps(i).astype(np.float32) / 1000
+
+
 T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
 
@@ -342,6 +346,18 @@ def plain(bag: Bag) -> None:
     odometry(bag)
     mounted(bag)
 
+
+BETWEEN = np.arange(-0.5, COUNT).tolist()
+"""Poses half a step before and after each image."""
+
+WAYS: dict[str, Callable[[Bag], object]] = {
+    "odometry": partial(odometry, numbers=BETWEEN),
+    "tf": partial(moving_tf, numbers=BETWEEN),
+}
+IMAGES: dict[str, Callable[[Bag], object]] = {
+    "16UC1": images,
+    "32FC1": partial(images, image=metres, encoding="32FC1"),
+}
 
 CONFIDENCE = "/camera/confidence/image_rect_raw"
 
