@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from taichi_mrf.alignment.se3 import moved
+from taichi_mrf.calibration.chessboard import camera_matrix
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -146,8 +147,8 @@ class Bag:
         """A CameraInfo; ``projection`` is that of the rectified images, ``part`` the region of interest as x,
         y, width and height."""
         roi = dict(zip(("x_offset", "y_offset", "width", "height"), part, strict=True))
-        P = np.column_stack([matrix(projection or camera), np.zeros(3)])
-        arrays = {"d": distortion or [0.0] * 5, "k": matrix(camera), "r": np.eye(3), "p": P}
+        P = np.column_stack([camera_matrix(projection or camera), np.zeros(3)])
+        arrays = {"d": distortion or [0.0] * 5, "k": camera_matrix(camera), "r": np.eye(3), "p": P}
         self.send(
             topic, "sensor_msgs/msg/CameraInfo", stamp, header=self.header(stamp, frame), roi=roi,
             height=camera.height, width=camera.width, distortion_model=model,
@@ -211,11 +212,6 @@ def rvl(image: NDArray[np.uint16]) -> bytes:
     nibbles += [0] * (-len(nibbles) % 8)
     words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
     return struct.pack(f"<II{len(words)}I", image.shape[1], image.shape[0], *words)
-
-
-def matrix(camera: PinholeCamera) -> NDArray[np.float64]:
-    """The 3 x 3 matrix of a camera."""
-    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
 
 
 @contextmanager
