@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import LivePage, chromium, missing
+from browser import chromium, live_page, missing
 from inputs_frames import write_frames
-from live_program import LiveProgram
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose
@@ -34,11 +33,7 @@ def test_another_recording_is_mapped_in_the_same_page(tmp_path: Path) -> None:
     write_recording(tmp_path / "first", 4, HERE)
     write_recording(tmp_path / "second", 3, FAR)
     flags = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
-    with (
-        LiveProgram(tmp_path, *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as page,
-    ):
+    with chromium() as browser, live_page(browser, tmp_path, *flags) as page:
         before = page.until_settled()
         assert len(before.keyframes) == 4
         assert page.input("Recording").input_value() == "first"
@@ -67,11 +62,7 @@ def test_a_level_cut_keeps_what_lies_below_it_in_a_world_whose_y_points_down(tmp
     size_m, height_m = 0.08, -0.3
     write_recording(tmp_path / "down", 3, Z_TO_MINUS_Y)
     flags = ("--voxel-size", f"{size_m}", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
-    with (
-        LiveProgram(tmp_path / "down", *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as page,
-    ):
+    with chromium() as browser, live_page(browser, tmp_path / "down", *flags) as page:
         page.until_settled()
         rows = np.floor(page.saved_map(tmp_path).decided.voxels(0.5)[0][:, 1] / size_m)
         page.tab("Map")
