@@ -83,12 +83,12 @@ def write_robot(folder: Path, steps: int) -> dict[str, str]:
             '<limit lower="-4" upper="4" effort="1" velocity="1"/></joint>'
         )
         parent, origin = f"link{i}", np.array([0, 0, 2 * HALF_M[2]])
-    (folder / "urdf").write_text(f'<robot name="six">{"".join(parts)}</robot>')
+    (folder / "six.urdf").write_text(f'<robot name="six">{"".join(parts)}</robot>')
     rows = [",".join(map(str, [step, *angles_at(step)])) for step in range(steps)]
     (folder / "joints.csv").write_text(
         "\n".join([",".join(["stamp", *(f"joint{i}" for i in range(6))]), *rows])
     )
-    names = {"robot": str(folder / "urdf"), "joints": str(folder / "joints.csv")}
+    names = {"robot": str(folder / "six.urdf"), "joints": str(folder / "joints.csv")}
     return {**names, "camera_link": "optical"}
 
 
