@@ -5,7 +5,6 @@ import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -204,11 +203,9 @@ def test_types_of_the_robots_own_are_listed_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    with Robot(write_bag(tmp_path, plain, kind="mcap"), foreign=("/arm/own",), domain=3) as sender:
-        listener = Thread(target=lambda: (sender.wait_for(TOPIC), sender.send_next(1000)))
-        listener.start()
+    bag = write_bag(tmp_path, plain, kind="mcap")
+    with Robot(bag, foreign=("/arm/own",), domain=3) as sender, sender.sending(1000, TOPIC):
         main(["info", f"{sender.source}?domain=3"])
-        listener.join()
     printed = capsys.readouterr().out
     assert "robot_msgs/msg/Own (its definition was not sent, and it is none of ROS's own types)" in printed
     assert re.search(rf"{TOPIC} +│ sensor_msgs/msg/Image +│ {COUNT}", printed), printed

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from threading import Event, Thread
@@ -54,16 +53,9 @@ def sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     """A robot that has sent its first image when it is opened."""
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     monkeypatch.setenv("COLUMNS", "200")
-    with Robot(write_bag(tmp_path, walk, kind="mcap")) as found:
-        thread = Thread(target=partial(begin, found))
-        thread.start()
+    bag, topics = write_bag(tmp_path, walk, kind="mcap"), ("/camera/depth", "/tf", "/tf_static")
+    with Robot(bag) as found, found.sending(BEFORE + 1, *topics):
         yield found
-        thread.join()
-
-
-def begin(sender: Robot) -> None:
-    sender.wait_for("/camera/depth", "/tf", "/tf_static")
-    sender.send_next(BEFORE + 1)
 
 
 def live(sender: Robot, link: FakeLink, limit: int) -> Session:
@@ -128,17 +120,9 @@ def test_a_lidar_s_map_is_that_of_its_bag_bit_for_bit(
 ) -> None:
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     with Robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
-
-        def send_first() -> None:
-            sender.wait_for("/points", "/tf", "/tf_static")
-            sender.send_next(3)
-
-        thread = Thread(target=send_first)
-        thread.start()
         link = FakeLink()
-        session = live(sender, link, COUNT)
-        thread.join()
-
+        with sender.sending(3, "/points", "/tf", "/tf_static"):
+            session = live(sender, link, COUNT)
         run_and_compare(sender, session, link, "cloud")
 
 

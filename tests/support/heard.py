@@ -1,6 +1,8 @@
 """A robot that sends a bag, what a client of its wire hears, and frames made of it, which are the bag's."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -54,6 +56,16 @@ class Sender:
             self.put(*each)
         self.sent += count
 
+    @contextmanager
+    def sending(self, count: int, *topics: str) -> Iterator[None]:
+        """It sends its next messages in the meantime, once somebody listens to some topics."""
+        thread = Thread(target=lambda: (self.wait_for(*topics), self.send_next(count)))
+        thread.start()
+        try:
+            yield
+        finally:
+            thread.join()
+
 
 def heard(client: Client, count: int) -> list[Raw]:
     """The messages that come, once they are ``count``."""
@@ -70,16 +82,8 @@ def heard(client: Client, count: int) -> list[Raw]:
 def begun(sender: Any, first: int, query: str = "", listen_to: str = "/odom", color: bool = False) -> Dataset:
     """The dataset of a robot that has sent its first messages while it was listened to."""
 
-    def send() -> None:
-        sender.wait_for(listen_to)
-        sender.send_next(first)
-
-    thread = Thread(target=send)
-    thread.start()
-    try:
+    with sender.sending(first, listen_to):
         return open_dataset(sender.source + query, color=color)
-    finally:
-        thread.join()
 
 
 def whole(live: Dataset) -> stream.Robot:
