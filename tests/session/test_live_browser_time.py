@@ -4,8 +4,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from browser import LivePage, Seen, chromium, missing
-from live_program import LiveProgram
+from browser import LivePage, Seen, chromium, live_page, missing
 
 from taichi_mrf import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
@@ -32,11 +31,7 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 def page() -> Iterator[LivePage]:
     """The room while a person walks in it; no more frames come."""
     flags = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--every", "2", "--limit", str(FRAMES))
-    with (
-        LiveProgram(WALKER, *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as opened,
-    ):
+    with chromium() as browser, live_page(browser, WALKER, *flags) as opened:
         opened.until_settled()
         yield opened
         assert opened.problems == []
