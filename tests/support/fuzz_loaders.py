@@ -49,6 +49,7 @@ from taichi_mrf.calibration.truth_sources import read_stamps
 from taichi_mrf.config.schema import Config, VolumeConfig, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.formats.frames_npz import FramesNpz
 from taichi_mrf.datasets.formats.rtabmap import RtabmapRecording
 from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
@@ -99,7 +100,7 @@ def frames_of(dataset: Dataset) -> bytes:
             refused.append((name, str(error)))
             continue
         assert frame.depth_m.shape == frame.camera.shape
-        own_cameras = isinstance(dataset, RtabmapRecording)
+        own_cameras = isinstance(dataset, RtabmapRecording | FramesNpz)
         if isinstance(frame.camera, PinholeCamera) and not frame.sensor and not own_cameras:
             assert frame.camera == dataset.camera
         assert frame.depth_m.dtype == np.float32
