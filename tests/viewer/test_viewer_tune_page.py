@@ -4,10 +4,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from handled_page import HandledPage
+from live_program import wait_for
+from raw_viewer_client import camera_message, raw_client
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.messages import KeyframeInfo
 from taichi_mrf.viewer.scene.base_panel import Used
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.messages import Scores
@@ -87,3 +92,19 @@ def test_held_out_views_and_frames_are_asked_for(handled: HandledTunePage) -> No
     handled.page.panel.frames.handles["count"].value = 20
     handled.take(Used("Held-out view", 0), Used("Use these frames", 0), Used("Stop the search", 0))
     assert handled.asked == [t.LookAt(1), t.ChooseFrames(t.FrameChoice(count=20)), t.StopSearch()]
+
+
+def test_home_is_inside_where_the_page_opens(handled: HandledTunePage) -> None:
+    T, no_bricks = np.eye(4), np.zeros((0, 3), np.int32)
+    camera, picture = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5), np.zeros((2, 2, 3), np.uint8)
+    handled.take(KeyframeInfo(0, "a", T, camera, 1, "on", picture, no_bricks, T))
+    handled.page.viewpoint.map_grew(np.full(3, -4.0), np.full(3, 4.0))
+    opening = handled.server.initial_camera.position
+    assert np.linalg.norm(opening) < 2
+    with raw_client(handled.server.get_port()) as browser:
+        browser.say(camera_message(position=[9, 9, 9]))
+        wait_for(lambda: len(handled.server.get_clients()) == 1, "the client")
+        client = next(iter(handled.server.get_clients()))
+        handled.take(Used("Home", client))
+        eye = handled.server.get_clients()[client].camera.position
+    np.testing.assert_allclose(eye, opening, atol=1e-6)

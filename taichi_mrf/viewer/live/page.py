@@ -139,6 +139,7 @@ class Page(BasePage[Panel]):
             self.viewpoint.start_over()
         self.begin_map(hello)
         self._hello, self._in_photo = hello, False
+        self.viewpoint.has_strip = hello.has_dates
         self.answer.clear()
         change(self.panel.unsaved, visible=False)
         self.keyframes.clear()
@@ -179,8 +180,7 @@ class Page(BasePage[Panel]):
         if self.map is None:
             return
         self.map.surface.take_view(view)
-        if not self._with_baseline:
-            self.viewpoint.look_as_pictured(view)
+        self.viewpoint.look_as_pictured(view, self.map.surface.vertices())
         if view.photo and not self._in_photo:
             self._in_photo = True
             self.panel.show_in_photo_colors()

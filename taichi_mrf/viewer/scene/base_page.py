@@ -119,11 +119,11 @@ class BasePage(Generic[P]):
         self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
 
     def look_from(self, side: Side, client: int) -> None:
-        """Show all that is seen of the map to one client, or else of its keyframes."""
+        """Show all that is seen of the map to one client, or else of its keyframes; or the opening view."""
         points = np.zeros((0, 3)) if self.map is None else self.map.seen_points()
         if not len(points) and (self.options.keyframes or self.options.path):
             points = self.keyframes.roster.path()[0].reshape(-1, 3)
-        if len(points):
+        if len(points) or side == "home":
             self.viewpoint.look_from(client, side, points)
 
     def notify(self, notice: m.Notice) -> None:
@@ -196,10 +196,10 @@ class BasePage(Generic[P]):
         self._show_used(self.map)
         if self.map.has_baseline != self._with_baseline:
             self._with_baseline = self.map.has_baseline
-            self.viewpoint.look_at_everything()
+            self.viewpoint.look_beside(self._with_baseline)
         box = self.map.box_m()
         if box is not None:
-            self.viewpoint.map_grew(*box)
+            self.viewpoint.map_grew(*box, self.map.seen_points)
         in_cut = self.options.free_space and not self.map.has_baseline
         shown = self.map.scale, in_cut, self.map.shows_changes
         if shown != self._explained:
