@@ -75,6 +75,13 @@ def test_the_list_names_what_appeared(page: LivePage) -> None:
     page.until(lambda seen: re.search(line, page.text()), "a line about the person")
 
 
+def test_ticks_are_thin_lines_that_leave_the_thumb_to_be_seen(page: LivePage) -> None:
+    ticks = page.input("Time (s)").locator(".mantine-Slider-mark")
+    widths = ticks.evaluate_all("all => all.map(tick => tick.getBoundingClientRect().width)")
+    assert len(widths) > 4
+    assert max(widths) <= 1.5
+
+
 def test_the_slider_shows_the_past_and_returns_to_now(page: LivePage, saved: MRFMap) -> None:
     now, then = voxels_of(saved), voxels_of(saved.at(BEFORE_S))
     assert now != then

@@ -20,8 +20,8 @@ from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.answer import SWITCHES, beside
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Clicked, Dragged
-from taichi_mrf.viewer.scene.base_panel import Joined, Used
+from taichi_mrf.viewer.live.panel import COMMANDS, Clicked, Dragged
+from taichi_mrf.viewer.scene.base_panel import AGREE, DECLINE, Joined, Used
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
 from taichi_mrf.voxels.layers import COLORS

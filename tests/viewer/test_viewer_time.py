@@ -195,9 +195,10 @@ def test_scrubbing_shows_how_far_the_camera_had_come_and_what_it_saw(running: Ti
     running.move_to(4.0)
     assert (steps()[0] == past).all()
     assert (steps()[1] != past).any()
-    assert "view 1, of 3.0 s" in running.time._list.content
+    assert ">nearest keyframe: view 1, at 3.0 s<" in running.time._list.content
+    assert "width:160px" in running.time._list.content
     running.move_to(4.9)
-    assert "view 2, of 6.0 s" in running.time._list.content
+    assert "view 2, at 6.0 s" in running.time._list.content
     running.span(6.0)
     assert (steps() == past).all()
     assert not running.time._list.visible

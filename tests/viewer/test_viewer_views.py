@@ -180,6 +180,23 @@ def test_home_is_the_opening_view_after_the_baseline_has_come_and_gone(handled: 
     np.testing.assert_allclose(homes[1], opening, atol=1e-6)
 
 
+def test_the_width_of_squares_is_told_by_the_panel_alone(handled: HandledPage) -> None:
+    assert handled.server.scene.get_handle_by_name("/ground") is not None
+    assert handled.server.scene.get_handle_by_name("/ground/square") is None
+    handled.page.show_counts()
+    assert "m squares" in handled.page.panel._shown.content
+
+
+def test_a_gizmo_can_be_grasped_on_a_large_map(handled: HandledPage) -> None:
+    T, crossed, picture = np.eye(4), np.zeros((0, 3), np.int32), np.zeros((2, 2, 3), np.uint8)
+    camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+    handled.take(m.KeyframeInfo(0, "view", T, camera, 1, "on", picture, crossed, T))
+    handled.page.actions["Move"](0)
+    assert handled.page.keyframes.gizmo.scale == pytest.approx(0.05 * 81, rel=0.02)  # the speck is 80 m away
+    low, high = BOX_M
+    assert handled.page.keyframes.grab((low, high)).scale == 0.5
+
+
 def test_a_single_voxel_can_be_looked_at() -> None:
     running = HandledPage(Page, HELLO)
     try:

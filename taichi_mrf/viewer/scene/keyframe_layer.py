@@ -25,6 +25,9 @@ FRUSTUM_M = 0.075
 RING_M = 0.2
 """Radius of the rings of a lidar, whose maps are of larger places, metres."""
 
+_GIZMO_M, _GIZMO_OF_MAP = 0.5, 0.05
+"""Least length of a gizmo's arrows, metres, and their length over the diagonal of a large map."""
+
 MOST_FROZEN = 50
 MOST_WAYPOINTS = 2000
 LEAST_TO_MERGE = 4096
@@ -184,13 +187,16 @@ class KeyframeLayer:
             if node is not None:
                 change(node, visible=self._path)
 
-    def grab(self) -> viser.TransformControlsHandle:
-        """Put a gizmo on the chosen keyframe. There must be one."""
+    def grab(self, map_m: ArrayLike | None) -> viser.TransformControlsHandle:
+        """Put a gizmo on the chosen keyframe. There must be one. ``map_m`` (2, 3) are the lowest and highest
+        corner of the map, which the gizmo grows with."""
         self.release()
         assert self.chosen is not None
         wxyz, position = placement(self.keyframes[self.chosen].T_world_camera)
+        across_m = 0.0 if map_m is None else float(np.linalg.norm(np.ptp(map_m, axis=0)))
+        length_m = max(_GIZMO_M, _GIZMO_OF_MAP * across_m)
         self.gizmo = self._scene.add_transform_controls(
-            "/gizmo", scale=0.5, depth_test=False, wxyz=wxyz, position=position
+            "/gizmo", scale=length_m, depth_test=False, wxyz=wxyz, position=position
         )
         return self.gizmo
 

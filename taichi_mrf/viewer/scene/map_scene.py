@@ -374,7 +374,7 @@ def square_m(extent_m: float) -> float:
 
 
 class Ground:
-    """Owns the grid in the scene, and the label with the width of its squares: ``square_m``, None without."""
+    """Owns the grid in the scene; its squares are ``square_m`` wide, None without a grid."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
@@ -409,9 +409,6 @@ class Ground:
             fade_strength=0.0,
             position=place,
         )
-        corner = square * first
-        corner[up[0]] = height_m
-        self._scene.add_label("/ground/square", f"squares of {square:g} m", position=corner - place)
 
     def hide(self) -> None:
         """Remove the grid from the scene."""
