@@ -269,7 +269,11 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
     # The standard deviations are 0.1, 0.2, 0.3 and 1 cm; equal ratios are equal steps.
-    assert (scale.low, scale.high, scale.measure.label) == (0.1, 1.0, "uncertainty: standard deviation (cm)")
+    assert (scale.low, scale.high, scale.measure.label) == (
+        0.1,
+        1.0,
+        "uncertainty: standard deviation (cm, log)",
+    )
     expected = scale.colors[np.rint(255 * np.log10([1, 2, 3, 10])).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
     drawn.draw(shade=False)

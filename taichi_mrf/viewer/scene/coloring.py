@@ -206,10 +206,13 @@ COLORINGS: dict[str, Coloring] = {
     "uncertainty": Coloring(
         "how unsure it is: the entropy of a voxel, or the standard deviation of the surface.",
         voxels=Measure(
-            "uncertainty: entropy (bits)", _entropy, lambda low, high: ramp("magma", 50), logarithmic=True
+            "uncertainty: entropy (bits, log)",
+            _entropy,
+            lambda low, high: ramp("magma", 50),
+            logarithmic=True,
         ),
         surface=Measure(
-            "uncertainty: standard deviation (cm)",
+            "uncertainty: standard deviation (cm, log)",
             lambda patch, points_m, up: 100.0 * patch.std_m,
             lambda low, high: ramp("magma", 50),
             logarithmic=True,
@@ -219,7 +222,7 @@ COLORINGS: dict[str, Coloring] = {
     "keyframes that see it": Coloring(
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
-            "keyframes that see the voxel",
+            "keyframes that see the voxel (log)",
             lambda shown, points_m, up: shown.seen,
             lambda low, high: ramp("plasma"),
             lambda numbers, heights_m: (1.0, max(float(numbers.max(initial=0.0)), 2.0)),
