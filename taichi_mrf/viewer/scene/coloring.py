@@ -206,13 +206,10 @@ COLORINGS: dict[str, Coloring] = {
     "uncertainty": Coloring(
         "how unsure it is: the entropy of a voxel, or the standard deviation of the surface.",
         voxels=Measure(
-            "uncertainty: entropy (bits, log)",
-            _entropy,
-            lambda low, high: ramp("magma", 50),
-            logarithmic=True,
+            "uncertainty: entropy (bits)", _entropy, lambda low, high: ramp("magma", 50), logarithmic=True
         ),
         surface=Measure(
-            "uncertainty: standard deviation (cm, log)",
+            "uncertainty: standard deviation (cm)",
             lambda patch, points_m, up: 100.0 * patch.std_m,
             lambda low, high: ramp("magma", 50),
             logarithmic=True,
@@ -222,7 +219,7 @@ COLORINGS: dict[str, Coloring] = {
     "keyframes that see it": Coloring(
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
-            "keyframes that see the voxel (log)",
+            "keyframes that see the voxel",
             lambda shown, points_m, up: shown.seen,
             lambda low, high: ramp("plasma"),
             lambda numbers, heights_m: (1.0, max(float(numbers.max(initial=0.0)), 2.0)),
@@ -247,7 +244,7 @@ def pale(color: ArrayLike) -> NDArray[np.uint8]:
 
 def legend_html(scale: Scale) -> str:
     """The scale as a strip with numbers, for the page."""
-    label = scale.measure.label
+    label = scale.measure.label + ", log scale" * scale.measure.logarithmic
     if not len(scale.colors):
         said = f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
         return said + _swatches(dict(scale.measure.key))
