@@ -272,7 +272,7 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     assert (scale.low, scale.high, scale.measure.label) == (
         0.1,
         1.0,
-        "uncertainty: standard deviation (cm), log scale",
+        "uncertainty: standard deviation (cm)",
     )
     expected = scale.colors[np.rint(255 * np.log10([1, 2, 3, 10])).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
