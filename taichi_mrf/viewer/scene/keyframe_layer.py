@@ -162,10 +162,18 @@ class KeyframeLayer:
                 self._draw(self.keyframes[id])
 
     def show_until(self, stamp_s: float | None) -> None:
-        """Highlight the camera's path up to a time; None: all of it."""
+        """Highlight the camera's path up to a time, and hide the keyframes after it and the camera of now;
+        None: all of it."""
         if stamp_s != self._until_s:
             self._until_s = stamp_s
             self.draw_path()
+            self._show_path()
+            for id in self._places:
+                shown = self._is_until(self.keyframes[id])
+                change(self._scene.get_handle_by_name(self._name(id)), visible=shown)
+
+    def _is_until(self, keyframe: KeyframeInfo) -> bool:
+        return self._until_s is None or keyframe.stamp_s <= self._until_s
 
     def draw_path(self) -> None:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
@@ -182,10 +190,10 @@ class KeyframeLayer:
         self._show_path()
 
     def _show_path(self) -> None:
-        for name in ("/path", "/camera"):
+        for name, shown in (("/path", self._path), ("/camera", self._path and self._until_s is None)):
             node = self._scene.get_handle_by_name(name)
             if node is not None:
-                change(node, visible=self._path)
+                change(node, visible=shown)
 
     def grab(self, map_m: ArrayLike | None) -> viser.TransformControlsHandle:
         """Put a gizmo on the chosen keyframe. There must be one. ``map_m`` (2, 3) are the lowest and highest
@@ -246,6 +254,7 @@ class KeyframeLayer:
             thickness=3.0 if is_chosen else 1.5,
             picture=picture if flat else None,
         )
+        change(self._scene.get_handle_by_name(name), visible=self._is_until(keyframe))
         if flat or picture is None or picture.shape[:2] != keyframe.camera.shape:
             self._scene.remove_by_name(f"{name}/picture")
         else:
