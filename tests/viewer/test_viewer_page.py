@@ -461,7 +461,6 @@ def test_the_answer_covers_neither_the_click_nor_the_middle_nor_the_panel(width:
 
 
 def test_what_is_selected_is_told_to_the_map_until_the_answer_is_closed(handled: LivePage) -> None:
-    handled.server.scene.reset()
     log_odds = np.full((1, 512), -900, np.int16)
     log_odds[0, 0] = 900  # the voxel at the origin
     none = np.zeros((0, 3), np.int32)
