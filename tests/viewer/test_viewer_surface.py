@@ -241,6 +241,13 @@ def test_while_a_map_has_no_surface_the_panel_says_voxels_and_why() -> None:
         running.take(HELLO, DONE)  # another map, which has one
         assert [widget.value for widget in shown] == ["surface", "height"]
         assert "There is no surface" not in widgets["draw_as"].hint
+        widgets["baseline"].value = True
+        running.take(DONE)
+        assert [widget.value for widget in shown] == ["voxels", "marginal probability"]
+        assert "both maps are drawn alike" in widgets["draw_as"].hint
+        widgets["baseline"].value = False
+        running.take(DONE)
+        assert [widget.value for widget in shown] == ["surface", "height"]
         widgets["color_by"].value = "uncertainty"
         running.take(replace(DONE, no_surface="all images are gone"))
         assert [widget.value for widget in shown] == ["voxels", "uncertainty"]

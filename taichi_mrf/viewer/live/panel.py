@@ -192,7 +192,9 @@ class Panel(BasePanel):
         if h.has_surface:
             past = "" if past_s is None else "it is made of the map of now, and this is an earlier time"
             later = "it is made at the end, or while paused" if moving or not status.voxels else ""
-            self.show_lack_of_surface(status.no_surface or past or later)
+            both = self.view_options.handles["baseline"].value
+            alike = "the baseline has none, and both maps are drawn alike" if both else ""
+            self.show_lack_of_surface(status.no_surface or past or later or alike)
         if status.voxels:
             self.offer_colorings(h, status.layers)
         coming = h.has_frames and not status.finished  # else there is nothing to play
