@@ -222,7 +222,7 @@ class BasePage(Generic[P]):
             self.viewpoint.look_beside(self._with_baseline)
         box = self.map.box_m()
         if box is not None:
-            self.viewpoint.map_grew(*box, self.map.seen_points)
+            self.viewpoint.map_grew(*box, self.map.seen_points, self.map.voxels)
         in_cut = self.options.free_space and not self.map.has_baseline
         shown = self.map.scale, in_cut, self.map.shows_changes
         if shown != self._explained:

@@ -117,6 +117,11 @@ class MapScene:
         every = np.concatenate(corners)
         return every.min(axis=0), every.max(axis=0)
 
+    @property
+    def voxels(self) -> int:
+        """Number of voxels of all maps that are shown or stand behind a surface."""
+        return sum(layer.voxels_shown for layer in self.layers.values())
+
     def counts(self) -> dict[str, int]:
         """How many of what is shown, or will be once everything has been sent, by name; ``voxels`` of the map
         also while its surface is shown in their place."""

@@ -16,8 +16,12 @@ from taichi_mrf.viewer.messages import SurfaceView
 Side = Literal["home", "top", "front", "side", "fit"]
 """From where to look at the map: *home* is the opening view, *fit* the direction in which a browser looks."""
 
-_GROWTH = 1.1
-"""The first view is chosen again when the map has grown by this factor."""
+_GROWTH, _MORE_POINTS = 1.1, 1.25
+"""The first view is chosen again when the map has grown by the first factor, or its number of voxels by the
+second one."""
+
+_UNTOLD = 4
+"""A browser may still tell of so many of its last places while it has been sent to a new one."""
 
 _ASPECT = 1.6
 """Width over height of a usual window."""
@@ -98,11 +102,11 @@ class ViewpointController:
         self._camera: Pose | None = None
         self._forwards = np.zeros(3)
         self._following = False
-        self._seen_size = 0.0
+        self._seen_size, self._seen_number = 0.0, 1
         self._view: _View | None = None
         self._pictured: _View | None = None
         self._beside = False
-        self._placed: dict[int, NDArray[np.float64]] = {}
+        self._placed: dict[int, list[NDArray[np.float64]]] = {}  # the last places of browsers, newest first
 
     def set_up(self, up: Up) -> None:
         """Set which way is up, from the first keyframe on."""
@@ -116,14 +120,14 @@ class ViewpointController:
         handle = self._server.get_clients().get(client)
         if handle is None:
             return
-        self._placed[client] = handle.camera.position
+        self._placed[client] = [handle.camera.position]
         view = self._shared_view()
         if view is not None:
             self._point(handle, view)
 
     def start_over(self) -> None:
         """Forget which users have moved the view: another place is shown from now on."""
-        self._placed = {id: client.camera.position for id, client in self._server.get_clients().items()}
+        self._placed = {id: [client.camera.position] for id, client in self._server.get_clients().items()}
 
     def camera_moved(self, T_world_camera: Pose, forwards: NDArray[np.float64]) -> None:
         """Store the pose of a camera that looks ``forwards`` (3,) in its own frame, and follow it if
@@ -184,14 +188,17 @@ class ViewpointController:
         low: NDArray[np.float64],
         high: NDArray[np.float64],
         seen: Callable[[], NDArray[np.float64]] = lambda: np.zeros((0, 3)),
+        number: int = 0,
     ) -> None:
         """Look at the points (n, 3) that are ``seen`` in the box from ``low`` to ``high`` (metres, world), or
-        else at the whole box: browsers that connect later, and those whose user has not moved the view. While
-        the view follows the camera it stays there."""
+        else at the whole box: browsers that connect later, and those whose user has not moved the view. It is
+        chosen again when the box or the ``number`` of points has grown. While the view follows the camera it
+        stays there."""
         size = float(np.linalg.norm(high - low))
-        if size < _GROWTH * self._seen_size or (self._pictured is not None and not self._beside):
+        grown = size >= _GROWTH * self._seen_size or number >= _MORE_POINTS * self._seen_number
+        if not grown or (self._pictured is not None and not self._beside):
             return
-        self._seen_size = size
+        self._seen_size, self._seen_number = size, max(number, 1)
         centre = (low + high) / 2
         up = up_vector(self.up)
         # Across the shorter level side, so that the longer one lies across the screen, and a little aslant.
@@ -212,7 +219,7 @@ class ViewpointController:
         if self._following:
             return
         for id, client in self._server.get_clients().items():
-            if np.allclose(client.camera.position, self._placed.get(id, np.inf), atol=1e-3):
+            if any(np.allclose(client.camera.position, at, atol=1e-3) for at in self._placed.get(id, ())):
                 self._point(client, view)
 
     def _follow(self) -> None:
@@ -253,7 +260,8 @@ class ViewpointController:
             client.camera.look_at = view.target_m
             client.camera.fov = view.fov_rad
             client.camera.near, client.camera.far = view.drawn_m
-        self._placed[client.client_id] = view.eye_m
+        places = self._placed.get(client.client_id, [])
+        self._placed[client.client_id] = [view.eye_m, *places[: _UNTOLD - 1]]
 
     def _foot(self, aspect: float, asked: bool = False) -> float:
         """Share of a window's height that is covered at its foot. On a phone the panel is folded at first;
