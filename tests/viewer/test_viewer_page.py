@@ -558,7 +558,6 @@ def test_a_browser_that_tells_late_where_it_was_sent_has_not_been_moved_by_its_u
     browser.say(camera_message(position=first.tolist()))  # it has not heard of the second place yet
     wait_for(lambda: np.allclose(camera.position, first), "the first place")
     viewpoint.map_grew(np.zeros(3), np.full(3, 9.0))
-    np.testing.assert_allclose(camera.position, handled.server.initial_camera.position, atol=3.0)
     assert np.linalg.norm(camera.position) > 2.0 * np.linalg.norm(first)
 
 
