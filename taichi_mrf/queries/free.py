@@ -19,8 +19,8 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.points import FREE, checked_points, state_of
 from taichi_mrf.queries.within import checked_paths, path_places
-from taichi_mrf.sensor.distortion import DistortedCamera
 from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.system.bundles import kernel
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.types import F32, F32Array
@@ -103,7 +103,8 @@ Lidar: the building."""
 
 
 def default_promise(m: Any) -> FreePromise:
-    """The bounds of a map that was not calibrated, by the camera of its keyframes. Raises ConfigError for a
+    """The bounds of a map that was not calibrated, by the camera of its keyframes: for any but a lidar's
+    those of depth cameras. Raises ConfigError for a
     map of another method than mrf: its log-odds have no table."""
     if not m.METHOD.has_messages:
         raise ConfigError(
@@ -111,7 +112,7 @@ def default_promise(m: Any) -> FreePromise:
             "with taichi_mrf.evaluation.free_space.calibrate_free"
         )
     cameras = (getattr(k, "camera", None) for k in m.keyframes.values())
-    by_lidar = any(isinstance(c, RayTable) and not isinstance(c, DistortedCamera) for c in cameras)
+    by_lidar = any(type(c) in (RayTable, SphericalCamera) for c in cameras)
     bound = np.array(_DEFAULT_BOUNDS["lidar" if by_lidar else "depth camera"])
     nothing = np.full(len(LEVELS), np.nan)
     return FreePromise(np.array(LEVELS), bound, nothing, nothing, nothing, blocks=0)

@@ -1,5 +1,6 @@
 """Cameras that are a table with the direction of each pixel: free rays, and the base of spherical cameras."""
 
+import copyreg
 import hashlib
 import math
 from functools import cached_property
@@ -247,6 +248,8 @@ class RayTable(Stored):
         return RayTable(directions if has_pattern else directions[0], origins_m)
 
     def __reduce__(self) -> tuple[Any, ...]:
+        if type(self) is not RayTable:  # its constructor may take other arguments
+            return copyreg.__newobj__, (type(self),), self.__dict__  # type: ignore[attr-defined]
         directions = self._table if self.has_pattern else self._table[0]
         origins = self._origins
         return RayTable, (directions, origins if origins is None or len(origins) > 1 else origins[0])

@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from pkgutil import resolve_name
+from importlib import import_module
+from pkgutil import iter_modules, resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -78,20 +79,24 @@ def stored_arrays(thing: object, prefix: str = "", what: str = "a noise model") 
 
 
 def is_stored(file: "NpzFile", prefix: str) -> bool:
-    """True if a file holds a noise model under these names."""
-    return f"{prefix}sigma" in file or prefix + _KIND in file
+    """True if a file holds a camera or a noise model under these names."""
+    return any(prefix + name in file for name in (_KIND, *_TOLD_BY))
 
 
 def read_stored(file: "NpzFile", prefix: str = "") -> Any:
-    """What :func:`stored_arrays` has made. Raises the file's error."""
-    found = Arrays(file, prefix)
-    with file.values_of(prefix.rstrip("_") or "the noise"):
-        if _KIND not in found:
-            return _told(name for name in _TOLD_BY if name in found).of_arrays(found)
-        name = found.array(_KIND, "U", ()).item()
-        if name not in KINDS:
-            raise MapFileError(f"its class {name} is not loaded: import the module that defines it first")
-        return KINDS[name].of_arrays(found)
+    """What :func:`stored_arrays` has made. Raises the file's error, also for a class that is neither of this
+    package nor imported."""
+    found, what = Arrays(file, prefix), prefix.rstrip("_") or "the noise"
+    name = found.array(_KIND, "U", ()).item() if _KIND in found else None
+    if name is not None and name not in KINDS:
+        for module in iter_modules(import_module(__package__).__path__, f"{__package__}."):
+            import_module(module.name)
+    if name is not None and name not in KINDS:
+        lacks = f"is of the class {name}, which is not loaded: import the module that defines it first"
+        raise file.problem(what, lacks)
+    with file.values_of(what):
+        kind = _told(each for each in _TOLD_BY if each in found) if name is None else KINDS[name]
+        return kind.of_arrays(found)
 
 
 def _told(names: Iterable[str]) -> type[Stored]:

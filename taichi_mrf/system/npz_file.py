@@ -55,14 +55,14 @@ class NpzFile:
             size = math.prod(shape) * dtype.itemsize
             info = self._members[name]
             if stream.tell() + size != info.file_size:
-                raise self._problem(name, f"is {dtype} {shape} by its header, but has {info.file_size} bytes")
+                raise self.problem(name, f"is {dtype} {shape} by its header, but has {info.file_size} bytes")
             self._zip.count(info.filename)
             values, place = np.empty(size, np.uint8), 0
             while chunk := stream.read(_CHUNK):
                 values[place : place + len(chunk)] = np.frombuffer(chunk, np.uint8)
                 place += len(chunk)
             if place != size:
-                raise self._problem(name, "ends too early")
+                raise self.problem(name, "ends too early")
             array = values.view(dtype) if size else np.empty(0, dtype)
             return array.reshape(shape, order="F" if fortran else "C")
 
@@ -77,13 +77,13 @@ class NpzFile:
         )
         if found.dtype.kind not in kinds or not fits:
             wanted = ", ".join("N" if n is None else str(n) for n in shape)
-            raise self._problem(
+            raise self.problem(
                 name, f"is {found.dtype} {found.shape}; expected ({wanted}) of another type or shape"
             )
         if found.dtype.kind == "f" and not np.isfinite(found).all():
-            raise self._problem(name, "holds a value that is not finite")
+            raise self.problem(name, "holds a value that is not finite")
         if found.dtype.kind == "U" and not _is_text(found):
-            raise self._problem(name, "holds a character outside Unicode")
+            raise self.problem(name, "holds a character outside Unicode")
         return found
 
     def integers(self, name: str, shape: Sequence[int | None], least: int, most: int) -> NDArray[Any]:
@@ -92,7 +92,7 @@ class NpzFile:
         found = self.array(name, "iu", shape)
         beyond = (found < least) | (found > most)
         if beyond.any():
-            raise self._problem(name, f"holds {found[beyond][0]}, which is not from {least} to {most}")
+            raise self.problem(name, f"holds {found[beyond][0]}, which is not from {least} to {most}")
         return found
 
     def scalar(self, name: str, kinds: str) -> Any:
@@ -107,7 +107,7 @@ class NpzFile:
         except TaichiMRFError as error:
             if isinstance(error, CapacityError) or str(error).startswith(f"{self._path}: "):
                 raise
-            raise self._problem(name, f"is damaged: {error}") from error
+            raise self.problem(name, f"is damaged: {error}") from error
 
     def check_manifest(self) -> None:
         """Raise the file's error if its members differ from those in its manifest."""
@@ -128,7 +128,7 @@ class NpzFile:
     def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:
         """A member's stream after its header, and the header's values."""
         if name not in self._members:
-            raise self._problem(name, "is missing")
+            raise self.problem(name, "is missing")
         try:
             with self._zip.open(self._members[name].filename) as stream:
                 shape, fortran, dtype = _read_header(stream)
@@ -136,9 +136,10 @@ class NpzFile:
         except TaichiMRFError:
             raise
         except Exception as error:  # zipfile, zlib and NumPy raise many kinds of exceptions
-            raise self._problem(name, f"cannot be read: {said(error)}") from error
+            raise self.problem(name, f"cannot be read: {said(error)}") from error
 
-    def _problem(self, name: str, problem: str) -> TaichiMRFError:
+    def problem(self, name: str, problem: str) -> TaichiMRFError:
+        """The file's error about an array, which names both."""
         return self._error(f"{self._path}: {name} {problem}")
 
 

@@ -1,6 +1,9 @@
 """A camera and noise models from outside, each written in one class: mapped, saved, loaded, drawn, and named
 by a parameter file."""
 
+import importlib
+import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from plugged_noise import PixelNoise
 
+import taichi_mrf.sensor
 from taichi_mrf.config.schema import SensorConfig, load
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -24,8 +28,9 @@ from taichi_mrf.sensor.noise import (
     noise_from_config,
 )
 from taichi_mrf.sensor.ray_table import RayTable
-from taichi_mrf.sensor.stored import KINDS, Arrays, stored_arrays
+from taichi_mrf.sensor.stored import KINDS, Arrays, is_stored, read_stored, stored_arrays
 from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.system.npz_file import open_npz
 from taichi_mrf.viewer.tune.plots import NoiseCurves
 
 ONE_BACKEND = pytest.mark.usefixtures("one_backend")
@@ -129,8 +134,46 @@ def test_it_maps_as_the_polynomial_of_the_same_values() -> None:
 def test_a_class_that_nobody_imported_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mapped(MRFMap(0.1, STEREO), FISHEYE).save(tmp_path / "map.npz")
     monkeypatch.delitem(KINDS, "FisheyeCamera")
-    with pytest.raises(MapFileError, match=r"map\.npz: camera_0 .*FisheyeCamera is not loaded: import the"):
+    with pytest.raises(
+        MapFileError,
+        match=r"map\.npz: camera_0 is of the class FisheyeCamera, which is not",
+    ):
         load_map(tmp_path / "map.npz")
+
+
+@pytest.mark.parametrize("thing", [STEREO, FISHEYE, PINHOLE, PolynomialNoise((0.01,))])
+def test_what_a_file_holds_is_found_by_any_of_its_names(tmp_path: Path, thing: Any) -> None:
+    """Also if an array tells its class, and no name does."""
+    write_npz(tmp_path / "own.npz", {**stored_arrays(thing, "own_"), "other": np.zeros(1)})
+    with open_npz(tmp_path / "own.npz", MapFileError, "a file") as file:
+        assert is_stored(file, "own_")
+        assert not is_stored(file, "another_")
+
+
+def test_a_class_of_the_package_is_found_by_a_program_that_has_not_imported_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the console program has not, where no user can import anything."""
+    (tmp_path / "added_noise.py").write_text(
+        "from taichi_mrf.sensor.noise import PolynomialNoise\n\n\nclass AddedNoise(PolynomialNoise):\n"
+        "    arrays = lambda self: {'added': self.sigma}\n"
+        "    of_arrays = classmethod(lambda cls, file: cls(file.array('added', 'f', (1, None))[0]))\n"
+    )
+    monkeypatch.setattr(taichi_mrf.sensor, "__path__", [*taichi_mrf.sensor.__path__, str(tmp_path)])
+    added = importlib.import_module("taichi_mrf.sensor.added_noise")
+    write_npz(tmp_path / "noise.npz", stored_arrays(added.AddedNoise((0.02,))))
+    monkeypatch.delitem(sys.modules, added.__name__)
+    monkeypatch.delitem(KINDS, "AddedNoise")
+    with open_npz(tmp_path / "noise.npz", MapFileError, "a file") as file:
+        found = read_stored(file)
+    assert type(found).__name__ == "AddedNoise"
+    np.testing.assert_array_equal(np.ravel(found.sigma), np.ravel(added.AddedNoise((0.02,)).sigma))
+
+
+def test_a_camera_of_rays_is_pickled_as_its_own_class() -> None:
+    FISHEYE.rays()
+    again = pickle.loads(pickle.dumps(FISHEYE))
+    assert (type(again), again.values, again) == (FisheyeCamera, FISHEYE.values, FISHEYE)
 
 
 def named_by(tmp_path: Path, noise: StoredNoise, more: str = "") -> SensorConfig:
