@@ -1,5 +1,5 @@
-"""Where the program starts, however it is called: ``taichi-mrf``, ``python -m taichi_mrf``, or a file of
-``apps/`` in a clone, where what the program needs may not be installed."""
+"""Entry point of the program, however it is called: ``taichi-mrf``, ``python -m taichi_mrf``, or a file of
+``apps/`` in a clone, where its dependencies may not be installed."""
 
 import os
 import sys

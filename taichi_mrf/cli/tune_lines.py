@@ -1,4 +1,4 @@
-"""What ``taichi-mrf tune`` prints of its tries, and the files that it leaves."""
+"""Output of ``taichi-mrf tune``: the lines on its trials, and the files that it leaves."""
 
 from pathlib import Path
 

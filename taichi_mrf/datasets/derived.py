@@ -256,7 +256,7 @@ def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[in
 def _recorded_pixels(
     camera: PinholeCamera, distortion: Sequence[float], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which recorded pixel saw along the ray of each undistorted pixel, -1 where none did."""
+    """Recorded pixel that saw along the ray of each undistorted pixel, -1 where none did."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     rays = camera.rays()[rows, columns]
     seen, _ = cv2.projectPoints(

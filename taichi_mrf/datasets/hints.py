@@ -177,8 +177,8 @@ def _is_cloud(path: Path) -> bool:
 
 
 def pose_files_hint(folder: Path, images: Sequence[Path], remedy: str = ONE_FILE) -> str | None:
-    """How to read a recording with poses, and perhaps intrinsics, in a text file for each image; None if
-    there are no such files. ``remedy`` says where the reader expects the poses."""
+    """Hint for reading a recording with poses, and perhaps intrinsics, in a text file for each image; None
+    if there are no such files. ``remedy`` says where the reader expects the poses."""
     places = [folder, *(child for child in sorted(folder.iterdir()) if is_folder(child))]
     for place in places:
         texts = [

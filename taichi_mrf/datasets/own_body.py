@@ -1,4 +1,4 @@
-"""What is known of the robot's own body, which its sensor sees: measurements of it are none of the world."""
+"""The robot's own body, as far as it is known: the sensor sees it, but it is no part of the world."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -17,7 +17,7 @@ AnyBody = TypeVar("AnyBody", bound="OwnBody")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnBody:
-    """Where the robot itself is. A pixel on it is neither a measurement of the world nor a missing one."""
+    """Extent of the robot itself. A pixel on it is neither a measurement of the world nor a missing one."""
 
     mask: str | None = field(default=None, metadata=_FILE)
     """A single-channel image (PNG) of the size of the stored depth images: 0 marks the robot's own body, any
@@ -63,7 +63,7 @@ class OwnBody:
         return OwnBody(**{each.name: getattr(self, each.name) for each in fields(OwnBody)})
 
     def within(self: AnyBody, folder: Path) -> AnyBody:
-        """The same, with files that are relative to a folder."""
+        """Copy whose files are relative to a folder."""
         mask, robot, joints = (path and str(folder / path) for path in (self.mask, self.robot, self.joints))
         return replace(self, mask=mask, robot=robot, joints=joints)
 

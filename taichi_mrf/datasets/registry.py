@@ -226,7 +226,7 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
 
 
 def _not_recognised(path: Path) -> str:
-    """Why a path cannot be opened, and what to do."""
+    """Reason why a path cannot be opened, and the remedy."""
     if is_folder(path):
         children = sorted(path.iterdir())
         inside = [child.name for child in _recordings(children)]

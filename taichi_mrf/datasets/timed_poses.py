@@ -98,7 +98,7 @@ def check_unit(
 
 
 def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, gap: float) -> str:
-    """Why nothing has a pose, by the ``stamps`` of both in seconds, and the remedy; empty if not known."""
+    """Reason why nothing has a pose, by the ``stamps`` of both in seconds, and the remedy; or empty."""
     if not len(stamps) or not len(posed):
         return ""
     first, last, begin, end = min(stamps), max(stamps), min(posed), max(posed)

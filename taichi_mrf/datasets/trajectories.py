@@ -129,8 +129,8 @@ def numbers_in(text: str, columns: Columns | None) -> list[float]:
 
 
 def stamps_a_second(stamps: Sequence[float]) -> float:
-    """How many a second the stamps of one file count: 1, or a thousand and more where they are too large for
-    seconds since 1970. The earliest tell, as nanoseconds of a clock that starts at 0 become as large."""
+    """Units per second of a file's stamps: 1, or a thousand and more where they are too large for seconds
+    since 1970. The earliest tell, as nanoseconds of a clock that starts at 0 become as large."""
     sizes = np.abs(np.asarray(stamps, np.float64))
     least = np.quantile(sizes[sizes > 0], _EARLIEST) if sizes.any() else 0.0
     return next((rate for first, rate in _MAGNITUDES if least >= first), 1.0)

@@ -1,4 +1,4 @@
-"""How well a map explains a depth image that it has not seen (MRFMap, sections III-D and V).
+"""Accuracy of a map on a depth image that it has not seen (MRFMap, sections III-D and V).
 
 The map is asked, for each pixel, at which depth its ray most likely meets the first surface: where
 omega (eq. 18) is largest, or where the ray meets the measured surface near there. The pixel is right if that

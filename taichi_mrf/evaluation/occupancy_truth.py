@@ -58,7 +58,7 @@ class OccupancyTruth:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many voxels are occupied, and how many are free."""
+        """Number of occupied voxels, and number of free ones."""
         return count(self.occupied_marks), count(self.free_marks)
 
     def occupied(self) -> NDArray[np.int32]:

@@ -218,7 +218,7 @@ def _level(m: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
 
 @dataclass(frozen=True)
 class MapToSend:
-    """What messages are made from: a map, and ``poses``, those of keyframes by their stamps in seconds."""
+    """Source of messages: a map, and ``poses``, those of its keyframes by stamp in seconds."""
 
     m: VoxelMap
     options: ExportOptions
@@ -231,7 +231,7 @@ class MapToSend:
 
     @property
     def stamp_s(self) -> float:
-        """When the newest keyframe was taken, 0 without one."""
+        """Stamp of the newest keyframe, 0 without one."""
         return max(self.poses, default=0.0)
 
 

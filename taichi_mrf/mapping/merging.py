@@ -151,7 +151,7 @@ def _located(parts: Sequence[MRFMap], names: Sequence[str]) -> list[LocatedRecor
 
 
 def _found(m: MRFMap, other: MRFMap) -> LocatedRecording:
-    """Where a map lies in another: by its keyframes, or, if any are frozen, by its voxels."""
+    """Location of a map in another: by its keyframes, or by its voxels if any keyframe is frozen."""
     if not m.frozen:
         return locate(other, [frame_of(keyframe) for keyframe in m.keyframes.values()])
     scans = list(scans_of(m, whole_map(m)))

@@ -348,7 +348,7 @@ class Placed(Derived):
         self._next = 0
 
     def awaiting(self) -> str:
-        """What the source waits for, once the frames that were kept are read."""
+        """The source's answer, once the kept frames have been read."""
         return "" if self._next < len(self._first) else self.source.awaiting()
 
     @property

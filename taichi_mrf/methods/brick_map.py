@@ -97,11 +97,11 @@ class BrickMap(PixelReader, Owned):
     view: View = owned_attribute()
 
     promise: "free.FreePromise | None" = None
-    """What levels of free space mean in this map, from frames that it has not seen
-    (evaluation.free_space.calibrate_free); ``taichi-mrf map`` finds it. None: by the default table."""
+    """Bounds for the levels of free space in this map, from frames that it has not seen
+    (evaluation.free_space.calibrate_free); ``taichi-mrf map`` sets them. None: the default table."""
 
     window: Any = None
-    """What keeps only a part of an MRFMap in memory (moving_window.MovingWindow), None if all of it stays."""
+    """Keeps only a part of an MRFMap in memory (moving_window.MovingWindow); None if all of it stays."""
 
     _next_id: int
     """The id of the next keyframe: how many were added."""
@@ -323,8 +323,8 @@ class BrickMap(PixelReader, Owned):
         camera: Camera,
         own: OwnEvidence = NOTHING,
     ) -> NDArray[np.float32]:
-        """How much each pixel of a depth image that is not in the map contradicts it, (H, W) float32 in nats:
-        above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
+        """Contradiction between the map and each pixel of a depth image that is not in it, (H, W) float32 in
+        nats: above 0 something new, below 0 a vanished surface (queries.contradiction.ray_scores)."""
         return contradiction.ray_scores(self, depth_m, T_world_camera, camera, own)
 
     @tensors.in_kind("points")
@@ -342,23 +342,22 @@ class BrickMap(PixelReader, Owned):
 
     @tensors.in_kind("points")
     def free_with(self, points: ArrayLike, level: float = 0.99, radius_m: float = 0.0) -> NDArray[np.bool_]:
-        """Whether points (N, 3) in metres, or balls of ``radius_m`` around them, are free at a level: of the
-        voxels that are, at most 1 - ``level`` contain matter. (N,) bool. A ball is free if all voxels that it
-        reaches into are (queries.free).
-
-        The level's bound is that of :attr:`promise`. Raises ConfigError for a level that cannot be promised,
-        and in a map that is not :attr:`settled`: its probabilities are not those that were calibrated."""
+        """True for points (N, 3) in metres, or balls of ``radius_m`` around them, that are free at a level:
+        at most 1 - ``level`` of all such voxels contain matter. (N,) bool. A ball is free if all voxels that
+        it overlaps are free (queries.free).  The level's bound is that of :attr:`promise`. Raises ConfigError
+        for a level that cannot be promised, and in a map that is not :attr:`settled`: its probabilities are
+        not the calibrated ones."""
         return free.free_with(self, points, level, radius_m)
 
     @tensors.in_kind("points")
     def path_free_with(self, points: ArrayLike, radius_m: float, level: float = 0.99) -> NDArray[np.bool_]:
-        """Whether all voxels that a ball reaches into on a path (N, 3) -> (), or paths (P, N, 3) -> (P,), are
-        free at a level; the rest as :meth:`free_with`."""
+        """True if all voxels that a ball overlaps along a path (N, 3) -> (), or paths (P, N, 3) -> (P,), are
+        free at a level; otherwise as :meth:`free_with`."""
         return free.path_free_with(self, points, radius_m, level)
 
     def box_free_with(self, lower: ArrayLike, upper: ArrayLike, level: float = 0.99) -> bool:
-        """Whether all voxels of an upright box between two corners, (3,) in metres, are free at a level; the
-        rest as :meth:`free_with`."""
+        """True if all voxels of an upright box between two corners, (3,) in metres, are free at a level;
+        otherwise as :meth:`free_with`."""
         return free.box_free_with(self, lower, upper, level)
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -75,7 +75,7 @@ class PointsInPlace(Bundle):
 
 @dataclass(frozen=True)
 class PointsMoved(Bundle):
-    """What PointsInPlace.split says of each point, (N, 3) each: devices that may lack float64."""
+    """Results of PointsInPlace.split for each point, (N, 3) each, for devices that may lack float64."""
 
     voxels: I32Array2
     shares: F32Array2

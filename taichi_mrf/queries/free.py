@@ -78,7 +78,7 @@ class FreePromise:
         return {"says": self.sentence(), "blocks": self.blocks, "levels": self.levels.tolist(), **figures}
 
     def sentence(self, level: float = DEFAULT_LEVEL) -> str:
-        """How far free space is promised at one of the levels, in one line."""
+        """The promise at one of the levels, in one line."""
         i = int(np.argmin(np.abs(self.levels - level)))
         if not self.blocks:
             return f"promised at {level:.0%} by the default table: no frames were held out"

@@ -128,7 +128,7 @@ class StoredNoise(Stored):
         """As NoiseModel has it."""
 
     def curves(self, depth_m: NDArray[np.float64]) -> Curves:
-        """What pictures show at depths (n,) in metres: here of (patches, TERMS) coefficients."""
+        """Curves for plots at depths (n,) in metres, here those of (patches, TERMS) coefficients."""
         return _curves(self.sigma, self.bias, depth_m)
 
 

@@ -33,7 +33,7 @@ class Stored(ABC):
     @classmethod
     @abstractmethod
     def of_arrays(cls: type[StoredT], file: "Arrays") -> StoredT:
-        """The same again. Raises the errors of the class's constructor, and the file's for wrong arrays."""
+        """Rebuild the object. Raises the constructor's errors, and the file's error for wrong arrays."""
 
 
 class Arrays:
@@ -83,7 +83,7 @@ def is_stored(file: "NpzFile", prefix: str) -> bool:
 
 
 def read_stored(file: "NpzFile", prefix: str = "") -> Any:
-    """What :func:`stored_arrays` has made. Raises the file's error."""
+    """The object that :func:`stored_arrays` stored. Raises the file's error."""
     found = Arrays(file, prefix)
     with file.values_of(prefix.rstrip("_") or "the noise"):
         if _KIND not in found:

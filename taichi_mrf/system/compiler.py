@@ -145,7 +145,7 @@ def kernel_class() -> Any:
 
 
 def kernels_of(kernel: Any) -> dict[Any, Any]:
-    """What was made of a kernel's source so far, by the types of its arguments."""
+    """The compiled forms of a kernel so far, by the types of its arguments."""
     made: dict[Any, Any] = getattr(kernel, COMPILERS[name()].made)
     return made
 

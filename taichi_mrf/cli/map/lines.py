@@ -1,4 +1,4 @@
-"""What ``taichi-mrf map`` shows of a run: its progress, its result, and the exit status that it ends with."""
+"""Output of ``taichi-mrf map``: the progress of a run, its result, and its exit status."""
 
 import math
 from pathlib import Path

@@ -17,7 +17,7 @@ _FORM = "foxglove, foxglove:PORT, foxglove:HOST:PORT, zenoh, zenoh:tcp/HOST:PORT
 
 @dataclass(frozen=True)
 class PublishFlags:
-    """Where the map is served to others."""
+    """Address at which the map is served to others."""
 
     publish: Annotated[str | None, tyro.conf.arg(metavar="foxglove[:PORT]|zenoh[:tcp/HOST:PORT]")] = None
     """Serve the map to Foxglove and to robots while it grows: voxels, the camera's path, tf, an octree for
@@ -65,7 +65,7 @@ class PublishFlags:
         return server
 
     def _place(self) -> dict[str, Any]:
-        """Where MessageServer serves."""
+        """Arguments of MessageServer that say where it serves."""
         assert self.publish is not None
         wire, _, rest = self.publish.partition(":")
         if wire == "zenoh":

@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # options are parsed with this file, and need no NumPy
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 NICENESS = 10
-"""How much lower the priority of mapping is than that of the page."""
+"""Reduction of the priority of mapping below that of the page."""
 
 PrintLine = Callable[[str], None]
 

@@ -1,4 +1,4 @@
-"""Which frames become keyframes, and which chunks their rays cross: what the plan is made from."""
+"""Survey for the plan: the frames that become keyframes, and the chunks that their rays cross."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -219,7 +219,7 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
 
 
 def _change(source: Dataset, camera: PinholeCamera) -> str:
-    """Where the intrinsics of images first differ, in words, when what these show is of one ``camera``."""
+    """Sentence that names the first change of intrinsics, where the images show one ``camera`` throughout."""
     first, last = 0, len(source) - 1
     begins = pinhole(source.read(0).camera, "doctor")
     other = begins if begins != camera else pinhole(source.read(last).camera, "doctor")

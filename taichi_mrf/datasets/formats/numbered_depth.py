@@ -184,8 +184,8 @@ def _frame(
 
 
 def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
-    """When an image was taken, in seconds: from its name if it tells, else from its number. Files of
-    matrices do not tell how many there are in a second."""
+    """Time of an image, in seconds: from its name if it tells, else from its number. Files of matrices do
+    not state their rate."""
     named = NUMBERED_IMAGE.fullmatch(path.name)
     if named is not None and named[3] is not None:
         return int(named[3][1:]) / 1e6

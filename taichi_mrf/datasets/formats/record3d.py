@@ -96,8 +96,8 @@ def unpacker() -> Any:
 
 
 def held_bytes(data: bytes) -> int:
-    """How many bytes the content of a file of depth or confidence has, unpacked. Raises DatasetError, which
-    names no file, for an LZFSE stream that is damaged."""
+    """Unpacked size, in bytes, of a file of depth or confidence. Raises DatasetError, which names no file,
+    for an LZFSE stream that is damaged."""
     if not is_packed(data):
         return len(data)
     place = total = 0
@@ -189,7 +189,7 @@ class Metadata:
             return [PinholeCamera(*size, *map(float, self.intrinsics[row])) for row in rows]
 
     def stamps(self, numbers: Sequence[int]) -> tuple[list[float], list[str]]:
-        """When each of these frames was taken, in seconds, and notes. Raises DatasetError."""
+        """Time of each of these frames, in seconds, and notes. Raises DatasetError."""
         times, rate = self.values.get("frameTimestamps"), self.values.get("fps")
         if times:
             try:

@@ -173,7 +173,7 @@ def _dtype(path: Path, entries: dict[str, list[str]]) -> np.dtype:
 
 
 def _points(path: Path, entries: dict[str, list[str]]) -> int:
-    """How many points there are: POINTS, or WIDTH times HEIGHT, which must be the same."""
+    """Number of points: POINTS, or WIDTH times HEIGHT, which must be the same."""
     sizes = {
         name: _whole(path, name, entries[name][0])
         for name in ("WIDTH", "HEIGHT", "POINTS")
@@ -387,7 +387,7 @@ def _array_name(file: NpzFile) -> str | None:
 
 
 def layout_notes(clouds: Sequence[Path]) -> list[str]:
-    """How the first cloud that can be read was taken, where that is a guess that may be wrong."""
+    """Interpretation of the first readable cloud, where it is a guess that may be wrong."""
     for path in clouds:
         if path.suffix.lower() != ".bin":
             continue
@@ -415,8 +415,8 @@ def _float_table(path: Path) -> NDArray[np.float32]:
 
 
 def _spread(table: NDArray[np.float32]) -> float:
-    """How much the numbers of a column differ: the mean logarithm of the variances. With a wrong number of
-    columns each is a mixture of x, y, z and the others, whose variances are larger."""
+    """Spread of the numbers in a column: the mean logarithm of the variances. With a wrong number of columns
+    each is a mixture of x, y, z and the others, whose variances are larger."""
     rows = table[np.isfinite(table).all(axis=1) & (np.abs(table) < 1e6).all(axis=1)].astype(np.float64)
     return float(np.log(rows.var(axis=0) + 1e-4).mean()) if len(rows) >= _LEAST_POINTS else 0.0
 

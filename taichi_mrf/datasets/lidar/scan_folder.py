@@ -41,7 +41,7 @@ _MATRICES = ("T_world_lidar", "T_world_sensor", "T_world_camera")
 
 @dataclass(frozen=True)
 class ScanPose:
-    """When a scan was taken, in seconds, and from where; ``read`` gives T_world_sensor (4, 4), or raises
+    """Time of a scan, in seconds, and its pose; ``read`` gives T_world_sensor (4, 4), or raises
     KeyframeError."""
 
     stamp: float

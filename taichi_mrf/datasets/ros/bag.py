@@ -273,7 +273,7 @@ def summarise(path: Path) -> BagSummary:
 
 
 def summary_of(reader: TopicSource) -> BagSummary:
-    """What topics hold, and how to name them. Raises DatasetError, which names the source."""
+    """The contents of topics, and how to name them. Raises DatasetError, which names the source."""
     topics = list(reader.topics.values())
     if any(topic.name.startswith(REALSENSE) for topic in topics):
         return BagSummary(topics, {}, reader.duration, [], [f"realsense:{reader.path}?poses=FILE"], "")

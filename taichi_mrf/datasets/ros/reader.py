@@ -319,7 +319,7 @@ class RosReader(TopicSource):
 
 
 def _unreadable(problem: str) -> str:
-    """Why rosbags cannot open a file, and the remedy."""
+    """Reason why rosbags cannot open a file, and the remedy."""
     missing = re.search(r"files are missing: \[(.*)\]", problem)
     if missing:
         names = ", ".join(Path(each.strip("' ")).name for each in missing[1].split(","))

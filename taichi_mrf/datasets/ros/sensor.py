@@ -28,7 +28,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 @dataclass(frozen=True)
 class SensorChoice(PoseChoice):
-    """How the messages of a sensor and their poses are chosen."""
+    """Choice of a sensor's messages and their poses."""
 
     depth: str = ""
     """The topic of depth images."""
@@ -169,8 +169,8 @@ def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[]
 
 
 class DepthCamera(NamedTuple):
-    """What is mapped: a topic of depth images, its messages, the cameras that took them, and their poses by
-    the frames of the images."""
+    """The source of a map: a topic of depth images, its messages, the cameras that took them, and their
+    poses by the frames of the images."""
 
     depth: DepthTopic
     sensor: BagSensor

@@ -98,8 +98,8 @@ def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], li
 
 
 def _delay(reader: TopicSource, topic: str) -> tuple[str, float]:
-    """How much later than stamped messages are recorded, in seconds, and the topic that tells: CameraInfo
-    beside ``topic``, tf or poses; "" and 0 if none does."""
+    """The topic that tells the delay, CameraInfo beside ``topic``, tf or poses, and the delay from a stamp to
+    the recording of its message in seconds; "" and 0 if none does."""
     beside = topic.rpartition("/")[0]
     types = {messages.CAMERA_INFO: 0, **dict.fromkeys(messages.TF, 1), **dict.fromkeys(messages.POSES, 2)}
     others = [

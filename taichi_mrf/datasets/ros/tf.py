@@ -394,7 +394,7 @@ def _senders(rows: Iterable[_Sent]) -> str:
 
 
 def _steps(poses: np.ndarray, apart: int = 1) -> np.ndarray:
-    """How far each pose (N, 4, 4) is from a later one, in units of what counts as the same."""
+    """Distance of each pose (N, 4, 4) from a later one, in units of what counts as the same."""
     first, last = poses[:-apart], poses[apart:]
     metres = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
     cosine = (np.einsum("nij,nij->n", first[:, :3, :3], last[:, :3, :3]) - 1) / 2

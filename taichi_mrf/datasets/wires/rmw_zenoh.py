@@ -182,7 +182,7 @@ class ZenohClient(_Node, Client):
                 self._subscribed[topic].append(self._declare(_SUBSCRIBER, publisher.described))
 
     def _nobody(self) -> str:
-        """Why there are no topics."""
+        """Reason why there are no topics."""
         info = self._session.info
         if not (self.address or info.routers_zid() or info.peers_zid()):
             return (
@@ -270,7 +270,7 @@ class ZenohNode(_Node):
 
 
 def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
-    """What a liveliness token says of a publisher, or of another ``entity``; None if it is of none."""
+    """The publisher, or other ``entity``, that a liveliness token describes; None if it describes none."""
     parts = token.split("/")
     if len(parts) != 13 or parts[0] != _TOKEN or parts[5] != entity:
         return None
@@ -280,7 +280,7 @@ def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
 
 
 def published_ns(attached: bytes) -> int | None:
-    """When a message was published, in nanoseconds, by what is attached; None in another layout."""
+    """Time when a message was published, in nanoseconds, from its attachment; None in another layout."""
     if len(attached) != _ATTACHED.size:
         return None
     _, stamp_ns, count, _ = _ATTACHED.unpack(attached)

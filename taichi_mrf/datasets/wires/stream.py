@@ -331,7 +331,7 @@ class LidarRobot(Robot, LidarRecording):
         return self.clouds.frame(posed.heard.entry, posed.heard.message, posed.pose, stamp, name)
 
     def until(self, entry: Entry, message: Any) -> float:
-        """When its last point was measured."""
+        """Time of its last point."""
         return self.clouds.until(entry, message)
 
     def is_posed(self, heard: Heard, pose: Pose) -> bool | None:

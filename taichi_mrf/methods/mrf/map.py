@@ -432,7 +432,7 @@ class MRFMap(BrickMap):
         return self.decided._grid() if self.has_surface else self._grid()
 
     def first_surfaces(self) -> NDArray[np.uint8]:
-        """What rays say of the voxels of ``view.pool`` beyond marginals, (slots, 512) (voxels/calls.py)."""
+        """The rays' verdict on voxels of ``view.pool`` beyond marginals, (slots, 512) (voxels/calls.py)."""
         return self._parts.decisions.calls(self.settled)
 
     def changes(self, since_s: float) -> "change.MapChange":

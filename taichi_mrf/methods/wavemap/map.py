@@ -51,7 +51,7 @@ NO_BEAM = -1
 """Stands for a beam where there are fewer than NEIGHBOURS."""
 
 WORTH_IT = 1.5
-"""How many times as wide a search must be for a narrower one to come first."""
+"""Least ratio of the widths of two searches for the narrower one to be tried first."""
 
 AT_SENSOR_M = 1e-4
 """A point nearer to the sensor than this has no direction."""
