@@ -24,6 +24,6 @@ def start(*command: str) -> int:
             raise
         clone = Path(__file__).resolve().parents[2]
         package = f"'{clone}'" if (clone / "pyproject.toml").is_file() else "taichi-mrf"
-        problem = f"the package {missing} is not installed: pip install {package} brings all that is needed"
+        problem = f"the package {missing} is not installed: pip install {package} adds all that is needed"
         print(f"taichi-mrf: {problem}", file=sys.stderr)
         return NOT_INSTALLED

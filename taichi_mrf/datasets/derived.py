@@ -423,7 +423,7 @@ def _shifted(
     track = dataset.own_poses()
     if track is None:
         track = _of_frames(dataset, stamps)
-        notes.append("late: the recording has the poses of frames alone; those between are interpolated")
+        notes.append("late: the recording has only the poses of frames; those between are interpolated")
     timed = TimedPoses(track[0], [pose_of(T, conventions) for T in track[1]])
     usual_s = float(np.median(np.diff(timed.stamps))) if len(timed) > 1 else 0.0
     gap_s = max_time_gap or max(INTERPOLATION_GAP, 2.0 * usual_s)

@@ -53,8 +53,8 @@ class OwnBody:
         for box in self.body_box:
             if not all(map(math.isfinite, box)) or not all(a < b for a, b in zip(box, box[3:], strict=False)):
                 raise ConfigError(
-                    "--body-box takes X0 Y0 Z0 X1 Y1 Z1 in metres, each of the first three below its fellow "
-                    f"of the last three, not {' '.join(f'{x:g}' for x in box)}"
+                    "--body-box takes X0 Y0 Z0 X1 Y1 Z1 in metres, the first three below the last three, "
+                    f"not {' '.join(f'{x:g}' for x in box)}"
                 )
 
     @property

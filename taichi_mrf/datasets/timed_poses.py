@@ -86,7 +86,7 @@ def check_unit(
     faster, slower = ("the poses", f"the {what}") if power > 0 else (f"the {what}", "the poses")
     so, remedy = f"so they seem to be {unit}", f"divide those of the {what} by {times:.0f}"
     if power > 0 and times < max(_SHORTER_UNITS) and min(posed) >= _SINCE_1970_S:
-        so = "so their unit is not the one that was taken"
+        so = "so their unit is not the one assumed"
         remedy = "add the line '# stamp_ns tx ty tz qx qy qz qw' (or stamp_us, stamp_ms) above its numbers"
     elif power > 0:
         remedy = f"add the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers"

@@ -314,8 +314,8 @@ def _longest_run(path: Path, poses: tuple[RecordedPose, ...]) -> tuple[RecordedP
     longest = max(runs, key=len)
     begins = ", ".join(f"{run[0].source.removeprefix(f'{path} ')} ({len(run)} poses)" for run in runs)
     warnings.warn(
-        f"{path}: its clock starts again, with runs from {begins}: only the longest is read; a file of "
-        "another run alone is read as that",
+        f"{path}: its clock restarts, with runs from {begins}: only the longest is read; to read "
+        "another, put it in a file of its own",
         stacklevel=2,
     )
     return longest

@@ -160,7 +160,7 @@ def reliability_bins(
 def _check(p: NDArray[Any], truth: NDArray[Any], bins: int) -> None:
     if p.ndim != 1 or p.shape != truth.shape:
         raise ConfigError(
-            f"probabilities of shape {p.shape} and truths of shape {truth.shape} do not go together: "
+            f"probabilities of shape {p.shape} and truths of shape {truth.shape} do not match: "
             "both must have the shape (N,)"
         )
     if truth.dtype != np.bool_:

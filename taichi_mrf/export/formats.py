@@ -51,7 +51,7 @@ _DEFAULTS = ExportOptions()
 
 NO_SURFACE = (
     "the images of keyframes that measured the surface are not in the map, or not of all: map the recording "
-    "anew with --keep-surface, or export from the map.npz of a run"
+    "again with --keep-surface, or export from the map.npz of a run"
 )
 """Error for a missing measured surface, and its remedy."""
 
@@ -88,9 +88,9 @@ def _format_of(path: str | Path) -> "ExportFormat":
         return FORMATS[suffix]
     known = ", ".join(FORMATS)
     if not suffix:
-        raise ConfigError(f"{path}: no file extension: cannot choose an export format; known are {known}")
+        raise ConfigError(f"{path}: no file extension: cannot choose an export format ({known})")
     near = difflib.get_close_matches(suffix, FORMATS, 1, cutoff=0.0)[0]
-    raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
+    raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? Choose from {known}")
 
 
 def require_libraries(path: str | Path) -> None:

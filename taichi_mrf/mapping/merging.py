@@ -1,4 +1,4 @@
-"""Several maps of one place as one map: each located in the others, then one pose graph over all overlaps.
+"""Merges several maps of one place: each is located in the others, then one pose graph covers all overlaps.
 
 The first map stays where it is. A map that is not found in it may be found in another that was. Keyframes of
 two maps that see the same are aligned with each other, as where a loop is closed (loops.py), and the graph of

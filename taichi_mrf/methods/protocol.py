@@ -93,7 +93,7 @@ class OccupancyMap(VoxelMap, Protocol):
 
     @property
     def stale(self) -> bool:
-        """True if the last removals and moves show only after :meth:`infer`."""
+        """True if recent removals and moves take effect only with the next :meth:`infer`."""
         ...
 
     promise: "FreePromise | None"

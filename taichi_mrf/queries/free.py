@@ -190,7 +190,7 @@ def bound_now(m: Any, level: float) -> float:
     """Log-odds below which free voxels of a map are free at a level. Raises ConfigError for a level that is
     not promised, in a map that is not settled, and in maps in chunks, which promise nothing."""
     if not hasattr(m, "promise"):
-        raise ConfigError("a map in chunks promises no level of free space: ask the map that it was made of")
+        raise ConfigError("a map in chunks promises no level of free space: ask the map it was made from")
     if not getattr(m, "settled", True):
         raise ConfigError("the map has changed since it was inferred, and promises nothing: call infer()")
     return (m.promise or default_promise(m)).most_log_odds(level)

@@ -1,4 +1,4 @@
-"""Cameras that are a table with the direction of each pixel: free rays, and the base of spherical cameras."""
+"""Cameras given by a table of each pixel's direction: arbitrary rays, and the base of spherical cameras."""
 
 import hashlib
 import math
@@ -210,7 +210,7 @@ class RayTable(Stored):
 
     @cached_property
     def digest(self) -> str:
-        """A text that tells these rays from all others."""
+        """A text that distinguishes these rays from all others."""
         content = hashlib.blake2b(repr((self.shape, self.has_pattern)).encode(), digest_size=16)
         content.update(self._table.tobytes())
         if self._origins is not None:

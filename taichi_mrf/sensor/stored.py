@@ -70,7 +70,7 @@ def stored_arrays(thing: object, prefix: str = "", what: str = "a noise model") 
     """A camera or a noise model as arrays by name. Raises MapFileError for one that cannot be saved."""
     if not isinstance(thing, Stored):
         name = type(thing).__name__
-        raise MapFileError(f"{what} of type {name} cannot be saved: its class has not the base Stored")
+        raise MapFileError(f"{what} of type {name} cannot be saved: its class is not derived from Stored")
     arrays = thing.arrays()
     if type(thing).arrays is not _told(arrays).arrays:
         arrays = {**arrays, _KIND: np.asarray(type(thing).__name__)}

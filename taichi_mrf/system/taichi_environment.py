@@ -65,7 +65,7 @@ def cache_problem() -> str | None:
     folder = cache_folder()
     if os.name == "nt" or (folder is not None and _is_writable(folder)):
         return None
-    return f"no folder can be written to for {compiler.title()}'s compiled kernels: set {cache_variable()}"
+    return f"no writable folder for {compiler.title()}'s compiled kernels: set {cache_variable()}"
 
 
 def _choose_cache() -> None:

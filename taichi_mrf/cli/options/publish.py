@@ -58,7 +58,7 @@ class PublishFlags:
         host = place.get("host", "localhost")
         if host not in LOOPBACK:
             print_line(
-                f"Warning: whoever can reach {host} can watch the map at {server.address}: no password."
+                f"Warning: anyone who can reach {host} can watch the map at {server.address}: no password."
             )
         who = "ROS 2 nodes" if "zenoh" in place else "Foxglove and robots"
         print_line(f"{who} get the map at {server.address}")
@@ -71,11 +71,11 @@ class PublishFlags:
         if wire == "zenoh":
             address, _, domain = rest.partition("?domain=")
             if not (domain or "0").isdecimal() or "?" in address:
-                raise ConfigError(f"--publish {self.publish}: is written {_FORM}")
+                raise ConfigError(f"--publish {self.publish}: must be {_FORM}")
             return {"zenoh": address, "domain": int(domain or 0)}
         host, _, port = rest.rpartition(":")
         if wire != "foxglove" or not (port.isdecimal() or self.publish == "foxglove"):
-            raise ConfigError(f"--publish {self.publish}: is written {_FORM}")
+            raise ConfigError(f"--publish {self.publish}: must be {_FORM}")
         if port and int(port) > 65535:
             raise ConfigError(f"--publish {self.publish}: the port must lie between 0 and 65535")
         return {"host": host.strip("[]") or "127.0.0.1", **({"port": int(port)} if port else {})}

@@ -40,7 +40,7 @@ class Verbosity:
 
     def __post_init__(self) -> None:
         if self.quiet and self.verbose:
-            raise ConfigError("--quiet and --verbose do not go together")
+            raise ConfigError("--quiet and --verbose cannot be combined")
 
 
 @dataclass(frozen=True)

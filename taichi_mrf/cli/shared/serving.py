@@ -22,7 +22,7 @@ def warn_of_host(host: str, port: int, what_they_can: str, print_line: PrintLine
         return
     here = port or "PORT"  # 0 is any
     print_line(
-        f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
+        f"Warning: the page at --host {host} has no password: anyone who can reach this machine can "
         f"{what_they_can}. It is safer to omit --host and to tunnel from where you watch: "
         f"ssh -L {here}:127.0.0.1:{here} USER@THIS-MACHINE"
     )

@@ -93,7 +93,7 @@ def write_round(path: Path, result: RoundResult) -> None:
 @contextmanager
 def _opened(path: Path) -> Iterator[NpzFile]:
     """The arrays by name, each read when it is asked for. Raises MapFileError."""
-    with open_npz(path, MapFileError, "a round of a submap that can be read") as file:
+    with open_npz(path, MapFileError, "a readable round of a submap") as file:
         yield file
 
 

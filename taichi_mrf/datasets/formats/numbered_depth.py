@@ -156,7 +156,7 @@ def _poses_by_number(
                 "or give one pose for each"
             )
         ordered = sorted(poses, key=lambda pose: pose.key)
-        return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in their order"]
+        return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in order"]
     if trajectory.layout == "stamped":
         first_key, last_key = min(by_key), max(by_key)
         inside = [number for number in numbers if first_key <= number <= last_key]

@@ -124,7 +124,7 @@ def unpacked(data: bytes, expected_bytes: int) -> bytes:
     try:
         content: bytes = lzfse.decompress(data)
     except Exception as error:
-        raise DatasetError("is damaged, it cannot be unpacked") from error
+        raise DatasetError("is damaged: it cannot be unpacked") from error
     if len(content) != expected_bytes:
         raise DatasetError(f"unpacks to {len(content):,} bytes, expected {expected_bytes:,}")
     return content
@@ -342,7 +342,7 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
     count = len(metadata.poses)
     posed = [number for number in numbers if number < count] if metadata.has_poses else numbers
     if not posed:
-        raise DatasetError(f"{metadata.where}: has {count} poses, for none of its {len(numbers)} frames")
+        raise DatasetError(f"{metadata.where}: has {count} poses, but none for its {len(numbers)} frames")
     dropped = len(numbers) - len(posed)
     notes = (
         [f"{dropped} of {len(numbers)} images dropped: {METADATA} has no pose for them"] if dropped else []

@@ -370,7 +370,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def _npz_points(path: Path) -> NDArray[np.float64]:
-    with open_npz(path, DatasetError, "an npz file that can be read") as file:
+    with open_npz(path, DatasetError, "a readable npz file") as file:
         name = _array_name(file)
         if name is None:
             held = ", ".join(file.names) or "nothing"
@@ -404,7 +404,7 @@ def _float_table(path: Path) -> NDArray[np.float32]:
     fitting = [count for count in _COLUMNS if len(data) % (4 * count) == 0]
     if not fitting:
         raise DatasetError(
-            f"{path}: has {len(data)} bytes, which is no whole number of points of "
+            f"{path}: has {len(data)} bytes, not a whole number of points of "
             f"{', '.join(str(4 * count) for count in sorted(_COLUMNS))} bytes"
         )
     values = np.frombuffer(data, "<f4")

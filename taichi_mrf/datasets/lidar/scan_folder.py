@@ -125,7 +125,7 @@ def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
 
 
 def _from_npz(path: Path, clouds: Sequence[Path]) -> tuple[dict[Path, ScanPose], list[str]]:
-    with open_npz(path, DatasetError, "an npz file that can be read") as file:
+    with open_npz(path, DatasetError, "a readable npz file") as file:
         name = next((name for name in _MATRICES if name in file), None)
         if name is None:
             raise DatasetError(

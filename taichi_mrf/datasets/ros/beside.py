@@ -182,7 +182,7 @@ def find_imu(sensor: BagSensor, wanted: str, first_s: float) -> tuple[BagImu | N
         return None, [f"imu: {name} is not used: tf has no fixed transform from {frame!r} to {optical!r}"]
     imu = BagImu(name, T_optical_imu, [found_rows[entry] for entry in sensor.run.of(list(found_rows))])
     up = upwards_at(imu.samples(imu.rows)[1], first_s)
-    level = "the first image is level by it" if up is not None else "which way is up it does not say"
+    level = "the first image is level by it" if up is not None else "it does not say which way is up"
     return imu, [f"imu: {name} measures turns; {level}"]
 
 

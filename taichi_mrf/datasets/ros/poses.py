@@ -330,15 +330,15 @@ def _read_poses(
         ]
         notes.append(
             f"{wrong.sum()} of {len(wrong)} messages of {name} have a stamp that is 0: their times of "
-            "recording are taken, less the usual delay, or they are left out where that is not known"
+            "recording are used, less the usual delay, or they are left out where that is not known"
         )
     if not found:
         raise DatasetError(f"{reader.path}: topic {name} contains no pose of the run; ?run=N chooses another")
     stamps, poses = [entry.stamp for entry, _ in found], [pose for _, pose in found]
     if alternates(stamps, poses):
         raise DatasetError(
-            f"{reader.path}: topic {name}: its poses jump to and fro, as of two publishers or robots: "
-            "?pose=TOPIC or ?poses=FILE takes others"
+            f"{reader.path}: topic {name}: its poses jump back and forth, as if from two publishers or "
+            "robots: ?pose=TOPIC or ?poses=FILE takes others"
         )
     return TimedPoses(stamps, poses), parent, child, notes
 

@@ -75,7 +75,7 @@ def choose_run(
     return (
         number,
         bounds,
-        [f"the clock starts again: of {words[number]} and {others}, the first named is read (?run=N)"],
+        [f"the clock restarts: of {words[number]} and {others}, the first is read (?run=N)"],
     )
 
 

@@ -195,7 +195,7 @@ def stereo_disparity(
             f"the right one {right.shape[1]} x {right.shape[0]}"
         )
     if left.shape[1] < settings.block_size:
-        raise FrameError(f"a stereo pair of {left.shape[1]} columns is narrower than a block to be compared")
+        raise FrameError(f"a stereo pair of {left.shape[1]} columns is narrower than a matching block")
     disparity = _semi_global(left, right, settings)
     # Mirrored, the right image is a left one; its disparities come back mirrored.
     from_right = _semi_global(right[:, ::-1], left[:, ::-1], settings)[:, ::-1]

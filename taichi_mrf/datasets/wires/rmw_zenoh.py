@@ -96,9 +96,7 @@ class _Node:
             for name, value in settings.items():
                 config.insert_json5(name, json.dumps(value))
         except self._zenoh.ZError as error:
-            raise problem(
-                f"{self.source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}"
-            ) from error
+            raise problem(f"{self.source}: is not a Zenoh address: write tcp/HOST:{PORT}") from error
         try:
             return self._zenoh.open(config)
         except self._zenoh.ZError as error:
@@ -205,7 +203,7 @@ class ZenohClient(_Node, Client):
             else:
                 self._publishers.pop(token, None)
             self.channels = {each.channel.topic: each.channel for each in self._publishers.values()}
-        self.problem = "" if self.channels else f"{self.source}: nobody publishes any more; trying again"
+        self.problem = "" if self.channels else f"{self.source}: nobody is publishing any more; trying again"
 
     def _take_in(self, sample: Any) -> None:
         if sample.kind != self._zenoh.SampleKind.PUT:

@@ -54,7 +54,7 @@ DECIDE_S = 3.0
 _LOOKED_AT = 4
 """Images whose numbers are looked at when a robot is opened."""
 
-ENDLESS = "a robot never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
+ENDLESS = "the stream never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
 @dataclass(frozen=True)

@@ -292,7 +292,7 @@ class WavemapMap(RecursiveMap[BeamFootprint]):
     ) -> None:
         """``parameters`` are fields of WavemapConfig, such as ``range_sigma=0.1`` or ``beams="nearest"``.
 
-        ``noise`` is not used: the model has a sigma of range of its own, the same at all ranges. Rays beyond
+        ``noise`` is not used: the model has its own sigma of range, the same at all ranges. Rays beyond
         ``max_depth`` show free space up to there. Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(wavemap, WavemapConfig, parameters, "wavemap", "WavemapMap")
