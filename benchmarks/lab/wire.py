@@ -122,13 +122,13 @@ class _Run:
 
     def result(self) -> Result:
         """The row's figures by their columns."""
-        from foxglove_robot import robot
+        from foxglove_robot import Robot
 
         way, equal, right, memory = self.way, "-", "-", "-"
         with TemporaryDirectory() as name:
             folder = Path(name)
             events, saved = folder / "events", folder / "live"
-            with robot(self._bag(folder, "all", range(len(self.views)))) as sender:
+            with Robot(self._bag(folder, "all", range(len(self.views)))) as sender:
                 self._live(sender, events, saved)
             taken, lags_s = _taken(events)
             if not way.lasts_s:

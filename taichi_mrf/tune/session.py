@@ -136,8 +136,10 @@ class TuneSession(SessionCore):
         began_with = self._newer
 
         def go_on(activity: str, share: float) -> bool:
-            prefix = f"{self._search_text()}: " if self._searching else ""
-            self.show_activity(prefix + activity, share)
+            if self.search is not None and self._searching:
+                activity = f"{self._search_text()}: {activity}"
+                share = (self.search.told + share) / self.search.tries
+            self.show_activity(activity, share)
             self._carry_out_requests()
             return self._newer == began_with and not self.is_over
 

@@ -1,11 +1,13 @@
 """``taichi-mrf map --refine-poses`` as a person runs it, on poses that were disturbed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from console import taichi_mrf
+from inputs_frames import write_frames
 
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import open_dataset
@@ -24,12 +26,8 @@ def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
     true = np.stack([frame.T_world_camera for frame in frames])
     steps = random.normal(size=(FRAMES, 6)) * [0.02, 0.02, 0.02, *np.radians([1.0, 1.0, 1.0])]
     steps[0] = 0
-    poses = np.stack([moved(T, step) for T, step in zip(true, steps, strict=True)])
-    c = frames[0].camera
-    K = [[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]
-    path = tmp_path / "walk.npz"
-    np.savez(path, depth_m=np.stack([f.depth_m for f in frames]), T_world_camera=poses, K=np.array(K))
-    return path, true
+    off = [replace(f, T_world_camera=moved(f.T_world_camera, s)) for f, s in zip(frames, steps, strict=True)]
+    return write_frames(tmp_path / "walk.npz", off), true
 
 
 def test_poses_come_nearer_to_the_true_ones_and_the_report_has_both(

@@ -2,17 +2,16 @@
 
 import importlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from new_interpreter import python
 
 from benchmarks.lab.__main__ import EXPERIMENTS
 
 
-def run(script: Path, *flags: str) -> str:
-    done = subprocess.run([sys.executable, str(script), *flags], capture_output=True, text=True, check=False)
+def run(*arguments: str | Path, cwd: Path | None = None) -> str:
+    done = python(*arguments, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -24,10 +23,9 @@ def test_every_experiment_of_the_laboratory_is_there(name: str) -> None:
 
 
 def test_an_experiment_of_the_laboratory_runs(repository: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "benchmarks.lab", "endless", "--limit", "4", "--voxel-sizes", "0.2"]
+    command = ["-m", "benchmarks.lab", "endless", "--limit", "4", "--voxel-sizes", "0.2"]
     command += ["--data", str(tmp_path), "--out", str(tmp_path / "out"), "--runtime.arch", "cpu"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run(*command, cwd=repository)
     assert (tmp_path / "out" / "endless.csv").stat().st_size > 0
 
 
@@ -57,10 +55,9 @@ def test_the_first_run_compiles_no_longer_than_before(repository: Path) -> None:
 
 def test_the_measurement_of_thin_things_runs(repository: Path, tmp_path: Path) -> None:
     out = tmp_path / "thin.json"
-    command = [sys.executable, "-m", "benchmarks.thin", "--voxel-size", "0.1", "--method", "mrf", "log_odds"]
+    command = ["-m", "benchmarks.thin", "--voxel-size", "0.1", "--method", "mrf", "log_odds"]
     command += ["--views", "6", "--held-out", "1", "--json", str(out), "--arch", "cpu"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run(*command, cwd=repository)
     mrf, log_odds = json.loads(out.read_text(encoding="utf-8"))
     assert (mrf["method"], log_odds["method"]) == ("mrf", "log_odds")
     assert mrf["precision"] > log_odds["precision"]

@@ -1,6 +1,7 @@
 """``--poses FILE`` and ``--follow`` on the command line."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import small_room
 from console import FAST, assert_refused, carry_out, report_of, taichi_mrf
 from datasets_recordings import stamped_line
+from inputs_frames import write_frames
 from live_program import wait_for
 
 from taichi_mrf.cli.options.live import Live
@@ -28,17 +30,8 @@ COUNT = 4
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A few frames of the small room, a second apart."""
-    frames = small_room.frames()[:COUNT]
-    camera = frames[0].camera
-    path = tmp_path_factory.mktemp("recording") / "walk.npz"
-    arrays = {
-        "depth_m": np.stack([frame.depth_m for frame in frames]),
-        "T_world_camera": np.stack([frame.T_world_camera for frame in frames]),
-        "K": np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]),
-        "stamp": np.arange(COUNT, dtype=np.float64),
-    }
-    np.savez(path, **arrays)
-    return path
+    frames = [replace(frame, stamp=float(i)) for i, frame in enumerate(small_room.frames()[:COUNT])]
+    return write_frames(tmp_path_factory.mktemp("recording") / "walk.npz", frames, stamped=True)
 
 
 def write_poses(path: Path, offset_m: float) -> None:

@@ -4,11 +4,10 @@ import contextlib
 import io
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
+from new_interpreter import output
 
 from taichi_mrf.cli.shared import interrupt
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
@@ -80,8 +79,7 @@ def test_nohup_is_respected() -> None:
         "with stop_on_signals(print) as request:\n    os.kill(os.getpid(), signal.SIGHUP)\n"
         "    print(request())"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout == "False\n", done.stderr
+    assert output(code) == "False"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

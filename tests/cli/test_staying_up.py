@@ -4,7 +4,6 @@ import json
 import random
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import small_room
 from console import taichi_mrf
 from killed_runs import OPTIONS, SOURCE, Run, disturbed, keyframes_of
+from new_interpreter import python
 from sliding_camera import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, sequence
 
 from taichi_mrf.cli.map.keep import Keeper, resumed_map
@@ -198,7 +198,7 @@ def test_half_written_files_of_the_dead_are_removed(tmp_path: Path) -> None:
     write += (
         "with atomic_path(sys.argv[1]) as path:\n    path.write_bytes(b'half')\n    os.kill(os.getpid(), 9)\n"
     )
-    subprocess.run([sys.executable, "-c", write, str(tmp_path / "map.npz")], check=False)
+    python("-c", write, tmp_path / "map.npz")
     (left,) = tmp_path.iterdir()
     (tmp_path / ".hidden.npz").write_bytes(b"")
     with atomic_path(tmp_path / "mine.npz") as alive:

@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from cluster_dask import dask_cluster
+from console import as_process
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.cli.map.summary import summary_line, summary_row
@@ -33,7 +34,7 @@ def command(*arguments: str | Path) -> list[str]:
 
 
 def taichi_mrf(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
+    return as_process("map", *arguments)
 
 
 def results(folder: Path) -> dict[str, Any]:

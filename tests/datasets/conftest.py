@@ -41,7 +41,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     """Opens a robot that sends its ``first`` messages while it is listened to. Returns the robot, the dataset
     and the bag of all that it sends."""
     pytest.importorskip("foxglove", reason="needs foxglove-sdk")
-    from foxglove_robot import robot
+    from foxglove_robot import Robot
 
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     monkeypatch.setattr(wired, "DECIDE_S", 0.3)
@@ -56,7 +56,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
             listen_to: str = "/tf_static",
         ) -> tuple[Any, Dataset, Path]:
             bag = write_bag(tmp_path, *parts, kind=kind)
-            sender = stack.enter_context(robot(bag))
+            sender = stack.enter_context(Robot(bag))
             return sender, begun(sender, first, query, listen_to, color), bag
 
         yield begin_one

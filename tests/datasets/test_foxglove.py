@@ -20,12 +20,12 @@ from taichi_mrf.errors import DatasetError
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
 import foxglove as library
-from foxglove_robot import Robot, robot
+from foxglove_robot import Robot
 
 
 @pytest.fixture
 def walk(tmp_path: Path) -> Iterator[Robot]:
-    with robot(write_bag(tmp_path, plain, kind="mcap")) as found:
+    with Robot(write_bag(tmp_path, plain, kind="mcap")) as found:
         yield found
 
 

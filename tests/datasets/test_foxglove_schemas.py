@@ -1,14 +1,26 @@
 """Foxglove's own messages, as its library encodes them, read as those of ROS that say the same."""
 
 import sys
-from functools import partial
 from pathlib import Path
-from threading import Thread
 
 import bag_clouds
 import numpy as np
 import pytest
-from inputs_bags import COUNT, FRAME, TOPIC, Bag, images, mounted, moving_tf, stamp, steps, write_bag
+from heard import SECONDS, assert_same_frame, begun
+from inputs_bags import (
+    BETWEEN,
+    COUNT,
+    FRAME,
+    IMAGES,
+    TOPIC,
+    WAYS,
+    Bag,
+    images,
+    mounted,
+    stamp,
+    steps,
+    write_bag,
+)
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.wires import robot as wired
@@ -19,15 +31,8 @@ from taichi_mrf.errors import DatasetError, TaichiMRFError
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
 from foxglove import messages as m
-from foxglove_robot import Robot, robot
+from foxglove_robot import Robot
 from google.protobuf.message import DecodeError
-
-SECONDS = 20
-BETWEEN = np.arange(-0.5, COUNT).tolist()
-
-
-def metres(i: int) -> np.ndarray:
-    return steps(i).astype(np.float32) / 1000
 
 
 def packed(bag: Bag) -> None:
@@ -53,11 +58,10 @@ def posed(bag: Bag) -> None:
         bag.pose_stamped("/camera/pose", stamp(i), "map", T)
 
 
-by_tf = partial(moving_tf, numbers=BETWEEN)
 PARTS = {
-    "whole numbers": [images, mounted, by_tf],
-    "floats": [partial(images, image=metres, encoding="32FC1"), mounted, by_tf],
-    "PNG": [packed, mounted, by_tf],
+    "whole numbers": [images, mounted, WAYS["tf"]],
+    "floats": [IMAGES["32FC1"], mounted, WAYS["tf"]],
+    "PNG": [packed, mounted, WAYS["tf"]],
     "poses": [images, posed],
     "clouds": [clouds],
 }
@@ -71,25 +75,14 @@ def test_frames_are_those_of_ros_bit_for_bit(
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     bag = write_bag(tmp_path, *PARTS[kind], kind="mcap")
     pose = "/camera/pose" if kind == "poses" else "/tf"
-    with robot(bag, own=encoding) as sender:
-        thread = Thread(target=send, args=[sender, pose])
-        thread.start()
-        live = open_dataset(sender.source, color=False)
-        thread.join()
+    with Robot(bag, own=encoding) as sender:
+        live = begun(sender, 1000, listen_to=pose)
         recorded = open_dataset(bag, color=False)
         assert wait_until(lambda: not live.awaiting(), SECONDS)
         ours = live.read(0)
         theirs = next(frame for frame in recorded if frame.name == ours.name)
     assert live.camera.shape == recorded.camera.shape
-    assert (ours.stamp, ours.name) == (theirs.stamp, theirs.name)
-    np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
-    np.testing.assert_array_equal(ours.points_m, theirs.points_m)
-    np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
-
-
-def send(sender: Robot, pose: str) -> None:
-    sender.wait_for(pose)
-    sender.send()
+    assert_same_frame(ours, theirs)
 
 
 def test_protobuf_is_decoded_by_its_descriptors() -> None:
@@ -124,11 +117,8 @@ def test_points_with_a_pose_of_their_own_are_told(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     monkeypatch.setattr(wired, "DECIDE_S", 0.3)
     at = m.Pose(position=m.Vector3(x=1.0, y=0.0, z=0.0), orientation=m.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
-    with robot(write_bag(tmp_path, clouds, kind="mcap"), own="protobuf") as sender:
+    with Robot(write_bag(tmp_path, clouds, kind="mcap"), own="protobuf") as sender:
         moved = m.PointCloud(frame_id="lidar", pose=at, point_stride=12, fields=[], data=bytes(12)).encode()
         sender.messages = [(t, s, moved if t == "/points" else data) for t, s, data in sender.messages]
-        thread = Thread(target=send, args=[sender, "/tf"])
-        thread.start()
         with pytest.raises(DatasetError, match="points have a pose in their frame"):
-            open_dataset(sender.source)
-        thread.join()
+            begun(sender, 1000, listen_to="/tf", color=True)

@@ -71,9 +71,9 @@ runpy.run_module("taichi_mrf", run_name="__main__")
     ],
 )
 def test_chunks_that_unpack_to_too_much_take_no_memory(tmp_path: Path, make: Any, words: str) -> None:
-    python("")  # --quick leaves the test out here, before half a gigabyte is packed
+    python("-c", "")  # --quick leaves the test out here, before half a gigabyte is packed
     path = make(tmp_path)
-    done = python(INFO.format(path=str(path)))
+    done = python("-c", INFO.format(path=str(path)))
     assert done.returncode == 2
     assert done.stderr.startswith(f"taichi-mrf: {path}: ")
     assert done.stderr.count("\n") == 1

@@ -8,9 +8,9 @@ import pytest
 from datasets_recordings import CAMERA, Content, write_image, write_seven_scenes, write_tum
 from hypothesis import given
 from hypothesis import strategies as st
-from inputs_bags import matrix
 from refusals import refused
 
+from taichi_mrf.calibration.chessboard import camera_matrix
 from taichi_mrf.datasets import ReadOptions, open_dataset
 from taichi_mrf.datasets.derived import strided
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -72,7 +72,7 @@ def test_undistorting_picks_the_pixel_that_saw_along_the_ray(tmp_path: Path, len
     frame = open_dataset(folder, undistort=LENSES[lens]).read(0)
     assert frame.camera == camera
     found = np.rint(frame.depth_m * 1000).astype(int)
-    K, D = matrix(camera), np.array(LENSES[lens])
+    K, D = camera_matrix(camera), np.array(LENSES[lens])
     across, down = cv2.initUndistortRectifyMap(K, D, None, K, (64, 48), cv2.CV_32FC1)
     columns, rows = np.rint(across).astype(int), np.rint(down).astype(int)
     inside = (columns >= 0) & (columns < 64) & (rows >= 0) & (rows < 48)
@@ -88,7 +88,7 @@ def seen_along(camera: PinholeCamera, lens: tuple[float, ...]) -> tuple[np.ndarr
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     rays = camera.rays().reshape(-1, 3)
     for _ in range(50):
-        seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix(camera), np.array(lens))
+        seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera_matrix(camera), np.array(lens))
         error = seen.reshape(-1, 2) - pixels.reshape(-1, 2)
         rays[:, :2] -= error / (camera.fx, camera.fy)
     assert np.abs(error).max() < 1e-9

@@ -111,16 +111,14 @@ def raw_mcap(path: Path, profile: str, encoding: str, content: Callable[[Bag], N
     is_ros1 = encoding == "ros1"
     with writing(path.with_suffix(".bag" if is_ros1 else ""), "ros1" if is_ros1 else "mcap") as bag:
 
-        def send(topic: str, name: str, at: float, **fields: object) -> None:
+        def note(topic: str, name: str, at: float, message: object) -> None:
             definition = bag.types.generate_msgdef(name, ros_version=1 if is_ros1 else 2)[0]
             name_there = name.replace("/msg/", "/") if is_ros1 else name
             channels[topic] = (name_there, "ros1msg" if is_ros1 else "ros2msg", definition, encoding)
             serialize = bag.types.serialize_ros1 if is_ros1 else bag.types.serialize_cdr
-            sent.append(
-                (round((START + at) * 1e9), topic, bytes(serialize(bag.message(name, **fields), name)))
-            )
+            sent.append((round((START + at) * 1e9), topic, bytes(serialize(message, name))))
 
-        bag.send = send  # type: ignore[method-assign]
+        bag.record = note  # type: ignore[method-assign]
         content(bag)
     names, out = list(channels), b"\x89MCAP0\r\n" + record(1, text(profile) + text("test"))
     for i, (topic, (name, kind, definition, packed)) in enumerate(channels.items(), start=1):

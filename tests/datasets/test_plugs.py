@@ -4,12 +4,12 @@ source is opened."""
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from console import FAST, mapped, report_of
+from new_interpreter import python
 from pages import code_of
 
 from taichi_mrf.datasets.entries import FORMATS
@@ -65,10 +65,7 @@ def walk(folder: Path) -> Path:
 
 
 def run(site: Path, repository: Path, *words: str) -> "subprocess.CompletedProcess[str]":
-    path = os.pathsep.join([str(repository), str(site)])
-    return subprocess.run(
-        [sys.executable, *words], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True
-    )
+    return python(*words, PYTHONPATH=os.pathsep.join([str(repository), str(site)]))
 
 
 def test_the_documented_plug_is_read_and_broken_ones_are_named(tmp_path: Path, repository: Path) -> None:

@@ -9,7 +9,7 @@ import inputs_bags
 import numpy as np
 import pytest
 from datasets_recordings import CAMERA
-from heard import SECONDS, came, one_by_one
+from heard import SECONDS, assert_same_frame, came, one_by_one
 from inputs_bags import (
     CONFIDENCE,
     COUNT,
@@ -26,7 +26,7 @@ from inputs_bags import (
     odometry,
     plain,
     stamp,
-)  # fmt: skip
+)
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
@@ -83,8 +83,7 @@ def test_colours_are_those_of_the_bag_bit_for_bit(begin: Begin, kind: str) -> No
     assert len(found) == len(recorded) == COUNT
     for ours, theirs in zip(found, recorded, strict=True):
         assert theirs.color is not None
-        np.testing.assert_array_equal(ours.color, theirs.color)
-        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
+        assert_same_frame(ours, theirs)
 
 
 def confidence_of_one(bag: Bag) -> None:
@@ -126,7 +125,7 @@ def test_confidence_is_that_of_the_bag_bit_for_bit(begin: Begin, query: str) -> 
     assert len(found) == COUNT
     for ours, theirs in zip(found, recorded, strict=True):
         assert theirs.sigma_m is not None
-        np.testing.assert_array_equal(ours.sigma_m, theirs.sigma_m)
+        assert_same_frame(ours, theirs)
 
 
 def test_colours_are_found_beside_depth_that_is_named(begin: Begin) -> None:

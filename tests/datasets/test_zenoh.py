@@ -4,29 +4,25 @@ import re
 import struct
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
-from threading import Thread
-from typing import Any
 
 import numpy as np
 import pytest
 from heard import SECONDS, begun, came, follow_bag, heard
 from inputs_bags import (
     COUNT,
+    IMAGES,
     IMU,
     INFO,
     TOPIC,
+    WAYS,
     confidence,
     images,
     imu,
     mounted,
-    moving_tf,
-    odometry,
     plain,
-    steps,
     write_bag,
-)  # fmt: skip
+)
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
@@ -38,10 +34,7 @@ from taichi_mrf.errors import DatasetError
 
 pytest.importorskip("zenoh", reason="needs eclipse-zenoh")
 
-from zenoh_robot import Robot, free_port, robot
-
-BETWEEN = np.arange(-0.5, COUNT).tolist()
-"""Poses half a step before and after each image."""
+from zenoh_robot import Robot, free_port
 
 TOKEN = (
     "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MP/%/%arm/camera_node/%camera%depth/"
@@ -118,7 +111,7 @@ def test_protocol_and_port_may_be_missing(address: str, whole: str) -> None:
 
 @pytest.fixture(params=["node", "router", "peer"])
 def walk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Robot]:
-    with robot(write_bag(tmp_path, plain, kind="mcap"), mode=request.param) as found:
+    with Robot(write_bag(tmp_path, plain, kind="mcap"), mode=request.param) as found:
         yield found
 
 
@@ -170,26 +163,18 @@ def test_a_lost_connection_is_made_again_with_its_topics(walk: Robot, client: Ze
     assert len(heard(client, len(wanted))) == len(wanted)
 
 
-def metres(i: int) -> np.ndarray:
-    return steps(i).astype(np.float32) / 1000
-
-
-WAYS = {"odometry": partial(odometry, numbers=BETWEEN), "tf": partial(moving_tf, numbers=BETWEEN)}
-IMAGES: dict[str, Any] = {"16UC1": images, "32FC1": partial(images, image=metres, encoding="32FC1")}
-
-
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", IMAGES)
 def test_frames_are_those_of_the_bag_bit_for_bit(tmp_path: Path, kind: str, way: str) -> None:
     bag = write_bag(tmp_path, IMAGES[kind], mounted, WAYS[way], kind="mcap")
-    with robot(bag) as sender:
+    with Robot(bag) as sender:
         live = begun(sender, 4, listen_to="/odom" if way == "odometry" else "/tf")
         follow_bag(sender, live, bag, COUNT)
 
 
 def test_confidence_and_turns_are_those_of_the_bag(tmp_path: Path) -> None:
     bag = write_bag(tmp_path, images, imu, confidence, kind="mcap")
-    with robot(bag) as sender:
+    with Robot(bag) as sender:
         live = begun(sender, 60, query="?poses=track", listen_to=IMU)
         assert live.read(0).sigma_m is not None
         sender.send_next(1000)
@@ -203,7 +188,7 @@ def test_confidence_and_turns_are_those_of_the_bag(tmp_path: Path) -> None:
 
 def test_a_robot_that_has_fixed_transforms_before_is_listened_to_is_mapped(tmp_path: Path) -> None:
     bag = write_bag(tmp_path, plain, kind="mcap")
-    with robot(bag) as sender:
+    with Robot(bag) as sender:
         sender.messages.sort(key=lambda each: each[0] != "/tf_static")
         fixed = sum(topic == "/tf_static" for topic, _, _ in sender.messages)
         sender.send_next(fixed)
@@ -218,11 +203,9 @@ def test_types_of_the_robots_own_are_listed_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    with robot(write_bag(tmp_path, plain, kind="mcap"), foreign=("/arm/own",), domain=3) as sender:
-        listener = Thread(target=lambda: (sender.wait_for(TOPIC), sender.send_next(1000)))
-        listener.start()
+    bag = write_bag(tmp_path, plain, kind="mcap")
+    with Robot(bag, foreign=("/arm/own",), domain=3) as sender, sender.sending(1000, TOPIC):
         main(["info", f"{sender.source}?domain=3"])
-        listener.join()
     printed = capsys.readouterr().out
     assert "robot_msgs/msg/Own (its definition was not sent, and it is none of ROS's own types)" in printed
     assert re.search(rf"{TOPIC} +│ sensor_msgs/msg/Image +│ {COUNT}", printed), printed
@@ -230,7 +213,7 @@ def test_types_of_the_robots_own_are_listed_and_left_out(
 
 def test_another_domain_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rmw_zenoh, "FIND_S", 0.5)
-    with robot(write_bag(tmp_path, plain, kind="mcap"), domain=7) as sender:
+    with Robot(write_bag(tmp_path, plain, kind="mcap"), domain=7) as sender:
         with pytest.raises(DatasetError, match=r"zenoh:tcp/127.0.0.1:\d+: connected, but .*\?domain=7"):
             open_dataset(sender.source)
         with pytest.raises(DatasetError, match="a domain is a number from 0 on"):
@@ -260,7 +243,7 @@ def test_an_option_that_there_is_not_is_told() -> None:
 
 
 def test_without_an_address_nodes_on_this_machine_are_found(tmp_path: Path) -> None:
-    with robot(write_bag(tmp_path, plain, kind="mcap"), domain=231, mode="peer", scouting=True) as sender:
+    with Robot(write_bag(tmp_path, plain, kind="mcap"), domain=231, mode="peer", scouting=True) as sender:
         try:
             client = ZenohClient("", 231)
         except DatasetError as error:

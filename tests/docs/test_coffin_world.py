@@ -1,12 +1,12 @@
 """The script that makes the scene of Table I from the authors' files, on files of their layout."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from new_interpreter import python
 
 from taichi_mrf.evaluation.experiments.scenes import coffin_scene
 from taichi_mrf.geometry.poses import look_at
@@ -59,8 +59,7 @@ def coefficients(name: str) -> np.ndarray:
 
 def convert(library: Path, wrapper: Path, repository: Path) -> "subprocess.CompletedProcess[str]":
     script = repository / "data" / "make_coffin_world.py"
-    words = [sys.executable, str(script), str(library), str(wrapper), str(library.parent / "coffin_world")]
-    return subprocess.run(words, capture_output=True, text=True, check=False)
+    return python(script, library, wrapper, library.parent / "coffin_world")
 
 
 def test_the_scene_has_the_files_views_camera_and_noise(

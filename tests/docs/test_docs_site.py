@@ -4,13 +4,13 @@ comes from a script or a command."""
 import dataclasses
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from new_interpreter import python
 
 import taichi_mrf
 import taichi_mrf.errors
@@ -40,10 +40,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build(configuration: Path, folder: Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", str(configuration)]
-    return subprocess.run(
-        [*command, "--site-dir", str(folder)], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
+    flags = ("--strict", "--config-file", configuration, "--site-dir", folder)
+    return python("-m", "mkdocs", "build", *flags, cwd=REPOSITORY)
 
 
 def html(site: Path, page: str) -> str:

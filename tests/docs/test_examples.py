@@ -2,12 +2,11 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
+from new_interpreter import python
 
 from taichi_mrf.session import own_loop
 
@@ -15,9 +14,7 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("[0-9]
 
 
 def printed(path: Path, folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, str(path)], cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = python(path, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

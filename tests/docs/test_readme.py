@@ -2,10 +2,9 @@
 
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
+from new_interpreter import python
 from pages import code_of
 
 
@@ -16,7 +15,7 @@ def test_the_example_runs(tmp_path: Path, repository: Path) -> None:
     program = example.replace("frames=20", "frames=4&width=160&height=120")
     program = program.replace('"map.npz"', repr(str(tmp_path / "map.npz")))
     assert program.count(str(tmp_path)) == program.count("width=160") == 1
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    done = python("-c", program)
     assert (done.returncode, done.stderr) == (0, "")
     assert "voxels are occupied" in done.stdout
     assert (tmp_path / "map.npz").stat().st_size > 0
@@ -63,7 +62,6 @@ def test_the_command_of_the_peers_gives_the_figures_of_their_file(tmp_path: Path
         "import pathlib, make_peers\n"
         f"print(make_peers.budgets(pathlib.Path({str(tmp_path / 'peers_budgets.csv')!r})))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=repository / "docs", capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "{('lidar', '20 cm', 'wavemap'): ['-', '.493', '.878', '-.71']}\n"
+    done = python("-c", program, cwd=repository / "docs")
+    row = "{('lidar', '20 cm', 'wavemap'): ['-', '.493', '.878', '-.71']}\n"
+    assert (done.returncode, done.stdout) == (0, row)

@@ -4,7 +4,6 @@ import cProfile
 import importlib
 import json
 import pstats
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import small_room
 from console import taichi_mrf
+from new_interpreter import python
 
 from benchmarks.speed import profile
 from benchmarks.speed.__main__ import main as speed_main
@@ -139,13 +139,7 @@ def test_every_kernel_with_a_floor_is_found_in_a_profile(tmp_path: Path) -> None
     """In a process, which starts Taichi with its profiler."""
     out = tmp_path / "p.json"
     flags = ["--measure", "profile", *common(out), "--plot", str(tmp_path / "a.svg")]
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.speed", *flags],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=REPOSITORY,
-    )
+    done = python("-m", "benchmarks.speed", *flags, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     (row,) = rows_of(out)
     found = {(kernel["stage"], kernel["name"]) for kernel in row["kernels"]}

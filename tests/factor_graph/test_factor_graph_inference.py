@@ -1,7 +1,5 @@
 """Every method against enumeration on graphs of up to 16 cells, for both sensor models."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import factor_graph_scenes
@@ -10,6 +8,7 @@ import pytest
 from factor_graph_scenes import CELL, beams_of, corner_beams, random_beams, room_beams
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from new_interpreter import python
 from oracles import factor_graph as reference
 
 from taichi_mrf.factor_graph.beams import Beams
@@ -245,15 +244,10 @@ for method in METHODS:
 @pytest.mark.usefixtures("one_backend")
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     """A process has one number of threads, so each is a process of its own."""
-    one, two = (
-        subprocess.run(
-            [sys.executable, "-c", PROGRAM, threads], check=True, text=True, capture_output=True,
-            cwd=Path(factor_graph_scenes.__file__).parent,
-        ).stdout
-        for threads in ("1", "2")
-    )  # fmt: skip
-    assert len(one.splitlines()) == 2 * len(METHODS)
-    assert one == two
+    folder = Path(factor_graph_scenes.__file__).parent
+    one, two = (python("-c", PROGRAM, threads, cwd=folder) for threads in ("1", "2"))
+    assert (one.returncode, len(one.stdout.splitlines())) == (0, 2 * len(METHODS))
+    assert (one.returncode, one.stdout) == (two.returncode, two.stdout)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -21,8 +21,7 @@ KINECT = PolynomialNoise((0.0012, 0.0, 0.0019))
 
 @cache
 def room() -> list[Frame]:
-    dataset = open_dataset("synthetic:room?width=160&height=120&frames=60", color=False)
-    return [dataset.read(index) for index in range(len(dataset))]
+    return list(open_dataset("synthetic:room?width=160&height=120&frames=60", color=False))
 
 
 def checked(frames: list[Frame], scale: float) -> StepCheck | None:

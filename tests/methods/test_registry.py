@@ -3,11 +3,10 @@
 import json
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from new_interpreter import output, python
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.plugs import PLUGS
@@ -50,21 +49,13 @@ def test_nothing_outside_the_methods_asks_for_their_classes(repository: Path) ->
 
 def test_plugs_load_without_taichi() -> None:
     imports = "; ".join(f"import {plug}" for plug in PLUGS)
-    subprocess.run(
-        [sys.executable, "-c", f"{imports}; import sys; assert not {set(COMPILERS)} & set(sys.modules)"],
-        check=True,
-    )
+    output(f"{imports}; import sys; assert not {set(COMPILERS)} & set(sys.modules)")
 
 
 def test_another_method_needs_its_folder_and_one_line(tmp_path: Path, repository: Path) -> None:
     support = repository / "tests" / "support"
     path = os.pathsep.join([str(support), str(repository), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, support / "toy_method" / "program.py", tmp_path],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
+    done = python(support / "toy_method" / "program.py", tmp_path, PYTHONPATH=path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert found == {

@@ -9,7 +9,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
-from browser import Browser, LivePage, Seen, missing
+from browser import Browser, LivePage, Seen, live_page, missing
 from live_program import LiveProgram
 
 from taichi_mrf import OCCUPIED, MRFMap
@@ -321,6 +321,7 @@ def test_a_click_on_a_voxel_is_answered_beside_it_and_in_the_plot(page: LivePage
     assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
 
 
+@pytest.mark.usefixtures("saved")  # which starts Taichi, with which the room is rendered
 def test_the_ray_of_a_pixel_is_that_of_its_measurement(page: LivePage) -> None:
     frame = open_dataset(ROOM).read(3)
     depth_m, camera = frame.depth_m, frame.camera
@@ -393,12 +394,9 @@ def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
 
 
 def test_a_map_with_colours_has_a_baseline_without(browser: Browser) -> None:
-    with (
-        LiveProgram(
-            ROOM, "--color", "--limit", "3", "--voxel-size", "8cm", "--runtime.arch", "cpu"
-        ) as program,
-        LivePage(browser, program.address) as page,
-    ):
+    with live_page(
+        browser, ROOM, "--color", "--limit", "3", "--voxel-size", "8cm", "--runtime.arch", "cpu"
+    ) as page:
         page.until_settled()
         page.tick("Baseline")
         page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")

@@ -297,7 +297,7 @@ def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None
     page.slide("Threshold", 0.5)
     page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
     page.tab("Save")
-    page.download("Recording (.viser)").save_as(tmp_path / "map.viser")
+    page.download("Stop and save: Recording (.viser)").save_as(tmp_path / "map.viser")
     content = zstandard.ZstdDecompressor().decompress((tmp_path / "map.viser").read_bytes()[8:])
     (length,) = struct.unpack("<Q", content[:8])
     recording = msgspec.msgpack.decode(content[8 : 8 + length])

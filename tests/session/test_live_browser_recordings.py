@@ -1,11 +1,12 @@
 """Another recording of a folder, chosen on the page in a real Chromium."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import LivePage, chromium, missing
-from live_program import LiveProgram
+from browser import chromium, live_page, missing
+from inputs_frames import write_frames
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.poses import Pose
@@ -13,39 +14,26 @@ from taichi_mrf.system import runtime
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
-IDENTITY = np.eye(4)
-FAR_M = 40.0
+HERE, FAR = np.eye(4), np.eye(4)
+FAR_M = FAR[0, 3] = 40.0
 """Distance between the two recordings' rooms."""
-
 
 Z_TO_MINUS_Y = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
-def write_recording(folder: Path, count: int, x_m: float, T_other_world: Pose = IDENTITY) -> None:
-    """Some frames of the built-in room, which stands at ``x_m``, in another world."""
+def write_recording(folder: Path, count: int, T_other_world: Pose) -> None:
+    """Some frames of the built-in room, in another world."""
     runtime.init("cpu")
     dataset = open_dataset(f"synthetic:room?frames={count}&width=96&height=72")
-    frames, poses = [dataset.read(i) for i in range(count)], []
-    for frame in frames:
-        poses.append(frame.T_world_camera.copy())
-        poses[-1][0, 3] += x_m
-        poses[-1] = T_other_world @ poses[-1]
-    camera = frames[0].camera
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    folder.mkdir()
-    depth_m = np.stack([frame.depth_m for frame in frames])
-    np.savez(folder / "frames.npz", depth_m=depth_m, T_world_camera=np.stack(poses), K=K)
+    frames = [replace(frame, T_world_camera=T_other_world @ frame.T_world_camera) for frame in dataset]
+    write_frames(folder / "frames.npz", frames)
 
 
 def test_another_recording_is_mapped_in_the_same_page(tmp_path: Path) -> None:
-    write_recording(tmp_path / "first", 4, 0.0)
-    write_recording(tmp_path / "second", 3, FAR_M)
+    write_recording(tmp_path / "first", 4, HERE)
+    write_recording(tmp_path / "second", 3, FAR)
     flags = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
-    with (
-        LiveProgram(tmp_path, *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as page,
-    ):
+    with chromium() as browser, live_page(browser, tmp_path, *flags) as page:
         before = page.until_settled()
         assert len(before.keyframes) == 4
         assert page.input("Recording").input_value() == "first"
@@ -72,13 +60,9 @@ def test_another_recording_is_mapped_in_the_same_page(tmp_path: Path) -> None:
 
 def test_a_level_cut_keeps_what_lies_below_it_in_a_world_whose_y_points_down(tmp_path: Path) -> None:
     size_m, height_m = 0.08, -0.3
-    write_recording(tmp_path / "down", 3, 0.0, Z_TO_MINUS_Y)
+    write_recording(tmp_path / "down", 3, Z_TO_MINUS_Y)
     flags = ("--voxel-size", f"{size_m}", "--runtime.arch", "cpu", "--evaluation.hold-out", "0")
-    with (
-        LiveProgram(tmp_path / "down", *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as page,
-    ):
+    with chromium() as browser, live_page(browser, tmp_path / "down", *flags) as page:
         page.until_settled()
         rows = np.floor(page.saved_map(tmp_path).decided.voxels(0.5)[0][:, 1] / size_m)
         page.tab("Map")

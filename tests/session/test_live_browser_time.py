@@ -4,8 +4,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from browser import LivePage, Seen, chromium, missing
-from live_program import LiveProgram
+from browser import LivePage, Seen, chromium, live_page, missing
 
 from taichi_mrf import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
@@ -32,11 +31,7 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 def page() -> Iterator[LivePage]:
     """The room while a person walks in it; no more frames come."""
     flags = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--every", "2", "--limit", str(FRAMES))
-    with (
-        LiveProgram(WALKER, *flags) as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as opened,
-    ):
+    with chromium() as browser, live_page(browser, WALKER, *flags) as opened:
         opened.until_settled()
         yield opened
         assert opened.problems == []
@@ -78,6 +73,13 @@ def test_what_moves_is_red_and_what_changed_has_boxes(page: LivePage, saved: MRF
 def test_the_list_names_what_appeared(page: LivePage) -> None:
     line = r"\d+\.0 s: something of \d\.\d x \d\.\d x \d\.\d m (appeared|left) at \(.+, .+, .+\)"
     page.until(lambda seen: re.search(line, page.text()), "a line about the person")
+
+
+def test_ticks_are_thin_lines_that_leave_the_thumb_to_be_seen(page: LivePage) -> None:
+    ticks = page.input("Time (s)").locator(".mantine-Slider-mark")
+    widths = ticks.evaluate_all("all => all.map(tick => tick.getBoundingClientRect().width)")
+    assert len(widths) > 4
+    assert max(widths) <= 1.5
 
 
 def test_the_slider_shows_the_past_and_returns_to_now(page: LivePage, saved: MRFMap) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from console import as_process, assert_refused, complaints, taichi_mrf
 from inputs_bags import Bag, write_bag
+from inputs_frames import write_frames
 from live_scene import FakeLink, assert_shown_is, finished, last_status, marginals, never, shown
 from numpy.typing import NDArray
 
@@ -67,16 +68,8 @@ def frames(room: str = "synthetic:room") -> list[Frame]:
 
 def write(folder: Path, chosen: Sequence[Frame], T: NDArray[np.float64]) -> Path:
     """A recording of some frames in a world of its own."""
-    folder.mkdir(parents=True)
-    camera = chosen[0].camera
-    np.savez(
-        folder / "frames.npz",
-        depth_m=np.stack([frame.depth_m for frame in chosen]),
-        T_world_camera=np.stack([T @ frame.T_world_camera for frame in chosen]),
-        stamp=np.array([frame.stamp for frame in chosen]),
-        K=np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]),
-    )
-    return folder
+    there = [replace(frame, T_world_camera=T @ frame.T_world_camera) for frame in chosen]
+    return write_frames(folder / "frames.npz", there, stamped=True).parent
 
 
 @dataclass(frozen=True)
@@ -291,11 +284,11 @@ def test_a_robot_goes_on_in_the_map_once_it_is_located(
     days: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("foxglove", reason="needs foxglove-sdk")
-    from foxglove_robot import robot
+    from foxglove_robot import Robot
 
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     said: list[str] = []
-    with robot(write_bag(tmp_path, walk, kind="mcap")) as sender:
+    with Robot(write_bag(tmp_path, walk, kind="mcap")) as sender:
 
         def send() -> None:
             sender.wait_for("/camera/depth", "/tf", "/tf_static")

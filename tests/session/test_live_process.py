@@ -5,8 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browser import Browser, LivePage, missing
-from live_program import LiveProgram
+from browser import Browser, live_page, missing
 from slider_latency import slider_answers
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
@@ -24,10 +23,7 @@ def recording_with_a_broken_frame(folder: Path) -> None:
 
 def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: Browser, tmp_path: Path) -> None:
     recording_with_a_broken_frame(tmp_path)
-    with (
-        LiveProgram(tmp_path, "--voxel-size", "0.1", "--runtime.arch", "cpu") as program,
-        LivePage(browser, program.address) as page,
-    ):
+    with live_page(browser, tmp_path, "--voxel-size", "0.1", "--runtime.arch", "cpu") as page:
         assert len(page.until_settled().keyframes) == 3
         page.tab("About")
         page.until(lambda seen: "frame-000001" in page.text(), "the list of problems")
@@ -44,10 +40,7 @@ def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: Browser, tmp_pat
 
 def test_a_slider_is_answered_while_the_map_is_inferred(browser: Browser) -> None:
     options = ("--voxel-size", "0.02", "--runtime.arch", "cpu", "--speed", "0.01")
-    with (
-        LiveProgram("synthetic:room?frames=8", *options) as program,
-        LivePage(browser, program.address, width=800, height=600) as page,
-    ):
+    with live_page(browser, "synthetic:room?frames=8", *options, width=800, height=600) as page:
         page.select("Speed", "as fast as possible")
         page.until(lambda seen: seen.activity.startswith("sweeping") and seen.agrees, "inference")
         answers = slider_answers(page, 4)

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import inputs_frames
 import numpy as np
 import pytest
 import small_room
@@ -20,15 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_backend")
 
 def write_frames(path: Path, *numbers: int) -> None:
     """A recording of some frames of the small room."""
-    frames = [small_room.frames()[number] for number in numbers]
-    camera = frames[0].camera
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        path,
-        depth_m=np.stack([frame.depth_m for frame in frames]),
-        T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
-        K=np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]),
-    )
+    inputs_frames.write_frames(path, [small_room.frames()[number] for number in numbers])
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from threading import Event, Thread
@@ -28,7 +27,7 @@ from taichi_mrf.viewer.messages import Notice, Request, Status, Update
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
-from foxglove_robot import Robot, robot
+from foxglove_robot import Robot
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -54,16 +53,9 @@ def sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     """A robot that has sent its first image when it is opened."""
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
     monkeypatch.setenv("COLUMNS", "200")
-    with robot(write_bag(tmp_path, walk, kind="mcap")) as found:
-        thread = Thread(target=partial(begin, found))
-        thread.start()
+    bag, topics = write_bag(tmp_path, walk, kind="mcap"), ("/camera/depth", "/tf", "/tf_static")
+    with Robot(bag) as found, found.sending(BEFORE + 1, *topics):
         yield found
-        thread.join()
-
-
-def begin(sender: Robot) -> None:
-    sender.wait_for("/camera/depth", "/tf", "/tf_static")
-    sender.send_next(BEFORE + 1)
 
 
 def live(sender: Robot, link: FakeLink, limit: int) -> Session:
@@ -127,18 +119,10 @@ def test_a_lidar_s_map_is_that_of_its_bag_bit_for_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wired, "LISTEN_S", 0.5)
-    with robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
-
-        def send_first() -> None:
-            sender.wait_for("/points", "/tf", "/tf_static")
-            sender.send_next(3)
-
-        thread = Thread(target=send_first)
-        thread.start()
+    with Robot(write_bag(tmp_path, spin, kind="mcap")) as sender:
         link = FakeLink()
-        session = live(sender, link, COUNT)
-        thread.join()
-
+        with sender.sending(3, "/points", "/tf", "/tf_static"):
+            session = live(sender, link, COUNT)
         run_and_compare(sender, session, link, "cloud")
 
 
@@ -200,7 +184,7 @@ def test_under_load_the_newest_image_is_mapped_at_its_own_pose(
                 done.wait((later - time) / 1e9 / 3)
 
     link = FakeLink(slow)
-    with robot(write_bag(tmp_path, around, kind="mcap")) as sender:
+    with Robot(write_bag(tmp_path, around, kind="mcap")) as sender:
         thread = Thread(target=send, args=[sender])
         thread.start()
         try:

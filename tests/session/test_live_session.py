@@ -249,7 +249,7 @@ def test_a_broken_frame_gives_a_notice_and_mapping_goes_on() -> None:
     link = FakeLink()
     session = session_of(link, room(4, broken=(1, 2)))
     assert marginals(finished(session)) == marginals(small_room.build([0, 3]))
-    assert link.errors() == [f"room {i}: the image is damaged" for i in (1, 2)]
+    assert link.errors() == [f"{room().frame_names[i]}: the image is damaged" for i in (1, 2)]
 
 
 def test_a_full_map_pauses_with_a_notice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,9 +55,8 @@ def send(
         rows[name] = values
     data = np.pad(rows.view(np.uint8).reshape(height, -1), ((0, 0), (0, 5)))
     bag.send(
-        topic, "sensor_msgs/msg/PointCloud2", at, header=bag.header(at, frame), height=height, width=width,
-        fields=fields, is_bigendian=big, point_step=dtype.itemsize, row_step=data.shape[1],
-        data=data.reshape(-1),
+        topic, "sensor_msgs/msg/PointCloud2", at, frame, height=height, width=width, fields=fields,
+        is_bigendian=big, point_step=dtype.itemsize, row_step=data.shape[1], data=data.reshape(-1),
     )  # fmt: skip
 
 

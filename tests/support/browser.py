@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from live_program import DEADLINE_S, wait_for
+from live_program import DEADLINE_S, LiveProgram, wait_for
 
 from taichi_mrf import MRFMap
 from taichi_mrf.system import runtime
@@ -359,3 +359,10 @@ class LivePage:
 
     def __exit__(self, *exception: Any) -> None:
         self.close()
+
+
+@contextmanager
+def live_page(browser: "Browser", *arguments: str | Path, **options: Any) -> Iterator[LivePage]:
+    """The page of ``taichi-mrf live``, run with these arguments."""
+    with LiveProgram(*arguments) as program, LivePage(browser, program.address, **options) as page:
+        yield page

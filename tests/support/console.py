@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from new_interpreter import python
+
 from taichi_mrf.cli.main import main
 from taichi_mrf.cli.parser import parse
 from taichi_mrf.cli.shared import progress
@@ -89,13 +91,7 @@ def as_process(
     *arguments: str | Path, options: tuple[str, ...] = (), before: Callable[[], None] | None = None
 ) -> Done:
     """Run the program as a process of its own; ``options`` are the interpreter's."""
-    return subprocess.run(
-        [sys.executable, *options, "-m", "taichi_mrf", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=before,
-    )
+    return python(*options, "-m", "taichi_mrf", *arguments, before=before)
 
 
 def complaints(stderr: str) -> str:

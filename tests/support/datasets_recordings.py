@@ -1,11 +1,12 @@
 """Writes small recordings in every folder format, for the tests of their readers."""
 
+import io
 import json
 import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -92,17 +93,15 @@ def write_seven_scenes(folder: Path, content: Content) -> Path:
 
 def write_tum(folder: Path, content: Content, start: float = 1305031102.0) -> Path:
     """Depth each 33 ms, colour 4 ms and poses 7 ms later."""
-    depth_lines, color_lines, pose_lines = ["# stamp file"], ["# stamp file"], ["# stamp pose"]
-    for i in range(content.count):
-        stamp = start + 0.033 * i
-        write_image(folder / f"depth/{stamp:.6f}.png", content.depth[i])
-        write_image(folder / f"rgb/{stamp + 0.004:.6f}.png", content.color[i])
-        depth_lines.append(f"{stamp:.6f} depth/{stamp:.6f}.png")
-        color_lines.append(f"{stamp + 0.004:.6f} rgb/{stamp + 0.004:.6f}.png")
-        pose_lines.append(stamped_line(stamp + 0.007, content.poses[i]))
-    (folder / "depth.txt").write_text("\n".join(depth_lines))
-    (folder / "rgb.txt").write_text("\n".join(color_lines))
-    (folder / "groundtruth.txt").write_text("\n".join(pose_lines))
+    stamps = start + 0.033 * np.arange(content.count)
+    for name, late_s, images in (("depth", 0.0, content.depth), ("rgb", 0.004, content.color)):
+        lines = ["# stamp file"]
+        for stamp, image in zip(stamps + late_s, images, strict=True):
+            write_image(folder / f"{name}/{stamp:.6f}.png", image)
+            lines.append(f"{stamp:.6f} {name}/{stamp:.6f}.png")
+        (folder / f"{name}.txt").write_text("\n".join(lines))
+    lines = ["# stamp pose", *map(stamped_line, stamps + 0.007, content.poses)]
+    (folder / "groundtruth.txt").write_text("\n".join(lines))
     (folder / "camera.txt").write_text(CAMERA_TXT)
     return folder
 
@@ -115,6 +114,16 @@ def write_numbered(folder: Path, content: Content, first: int = 0, place: str = 
             write_image(folder / "color" / f"{first + i:05d}.png", content.color[i])
     (folder / "camera.txt").write_text(CAMERA_TXT)
     return folder
+
+
+def doubled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Each pixel twice along each side."""
+    return np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
+
+
+def changed(values: dict[str, Any], changes: dict[str, object]) -> dict[str, Any]:
+    """Values of which ``changes`` replace some, and None leaves them out."""
+    return {name: value for name, value in (values | changes).items() if value is not None}
 
 
 def write_rows(path: Path, poses: list[Pose]) -> Path:
@@ -136,20 +145,18 @@ K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
 def write_scannet(folder: Path, content: Content, color: bool = False) -> Path:
     """Numbers without leading zeros, of which the tenth comes after the second. With ``color``, images of
     the depth camera's pixels."""
-    for i in range(content.count):
-        write_image(folder / f"depth/{5 * i}.png", content.depth[i])
-        (folder / "pose").mkdir(exist_ok=True)
-        (folder / f"pose/{5 * i}.txt").write_text(text_of(content.poses[i]))
-    (folder / "intrinsic").mkdir()
+    for name in ("pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
     wide = np.eye(4)
     wide[:3, :3] = K
-    (folder / "intrinsic/intrinsic_depth.txt").write_text(text_of(wide))
-    if color:
-        for i in range(content.count):
-            write_image(folder / f"color/{5 * i}.png", content.color[i])
-        (folder / "intrinsic/intrinsic_color.txt").write_text(text_of(wide))
-        for name in ("depth", "color"):
+    for name, images in (("depth", content.depth), *([("color", content.color)] if color else [])):
+        (folder / f"intrinsic/intrinsic_{name}.txt").write_text(text_of(wide))
+        if color:
             (folder / f"intrinsic/extrinsic_{name}.txt").write_text(text_of(np.eye(4)))
+        for i, image in enumerate(images):
+            write_image(folder / f"{name}/{5 * i}.png", image)
+    for i, pose in enumerate(content.poses):
+        (folder / f"pose/{5 * i}.txt").write_text(text_of(pose))
     return folder
 
 
@@ -176,31 +183,23 @@ def write_record3d(
     leaves them out."""
     height, width = content.size
     K_color = np.array([[28.0, 0, 2 * 7.5 + 0.5], [0, 30.0, 2 * 5.5 + 0.5], [0, 0, 1]])
-    metadata: dict[str, object] = {
-        "w": 2 * width,
-        "h": 2 * height,
-        "dw": width,
-        "dh": height,
-        "fps": 10,
-        "K": column_by_column(K_color),
-        "poses": [[*quaternion_of(T[:3, :3] @ np.diag([1.0, -1.0, -1.0])), *T[:3, 3]] for T in content.poses],
-    }
-    metadata = {name: value for name, value in (metadata | changes).items() if value is not None}
+    poses = [[*quaternion_of(T[:3, :3] @ np.diag([1.0, -1.0, -1.0])), *T[:3, 3]] for T in content.poses]
+    metadata = {"w": 2 * width, "h": 2 * height, "dw": width, "dh": height, "fps": 10}
+    metadata |= {"K": column_by_column(K_color), "poses": poses}
+    metadata = changed(metadata, changes)
     levels = np.ascontiguousarray(np.broadcast_to(np.arange(width, dtype=np.uint8) % 3, content.size))
     members = {"metadata": json.dumps(metadata).encode()}
     for i in range(content.count):
-        color = np.repeat(np.repeat(content.color[i], 2, axis=0), 2, axis=1)
+        color = doubled(content.color[i])
         members[f"rgbd/{i}.depth"] = pack((content.depth[i] / np.float32(1000)).astype("<f4").tobytes())
         members[f"rgbd/{i}.conf"] = pack(levels.tobytes())
         members[f"rgbd/{i}.jpg"] = cv2.imencode(".png", color[..., ::-1])[1].tobytes()  # comes back exactly
-    if path.suffix:
-        with zipfile.ZipFile(path, "w") as archive:
-            for name, data in members.items():
-                archive.writestr(name, data)
-        return path
-    for name, data in members.items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        (path / name).write_bytes(data)
+    file = path if path.suffix else io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+        if not path.suffix:
+            archive.extractall(path)
     return path
 
 
@@ -222,27 +221,16 @@ def write_nerfstudio(folder: Path, content: Content, **changes: object) -> Path:
     frames = []
     for i in range(content.count):
         write_image(folder / f"depth/frame_{i + 1:05d}.png", content.depth[i])
-        color = np.repeat(np.repeat(content.color[i], 2, axis=0), 2, axis=1)
-        write_image(folder / f"images/frame_{i + 1:05d}.png", color)
-        frames.append(
-            {
-                "file_path": f"images/frame_{i + 1:05d}.png",
-                "depth_file_path": f"depth/frame_{i + 1:05d}.png",
-                "transform_matrix": (content.poses[i] @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
-            }
-        )
-    values = {
-        "camera_model": "OPENCV",
-        "w": 2 * width,
-        "h": 2 * height,
-        "fl_x": 28.0,
-        "fl_y": 30.0,
-        "cx": 2 * 7.5 + 0.5,
-        "cy": 2 * 5.5 + 0.5,
-        "frames": frames,
-    }
-    values = {name: value for name, value in (values | changes).items() if value is not None}
-    (folder / "transforms.json").write_text(json.dumps(values))
+        write_image(folder / f"images/frame_{i + 1:05d}.png", doubled(content.color[i]))
+        files = {
+            "file_path": f"images/frame_{i + 1:05d}.png",
+            "depth_file_path": f"depth/frame_{i + 1:05d}.png",
+        }
+        T = content.poses[i] @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append(files | {"transform_matrix": T.tolist()})
+    values = {"camera_model": "OPENCV", "w": 2 * width, "h": 2 * height, "fl_x": 28.0, "fl_y": 30.0}
+    values |= {"cx": 2 * 7.5 + 0.5, "cy": 2 * 5.5 + 0.5, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(changed(values, changes)))
     return folder
 
 

@@ -5,17 +5,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from datasets_recordings import (
-    CAMERA,
-    FORMATS,
-    Content,
-    arrays,
-    write_npz,
-    write_record3d,
-    write_stray,
-)
+from datasets_recordings import CAMERA, FORMATS, Content, arrays, write_npz, write_record3d, write_stray
 from inputs_bags import writing
-from rtabmap_database import OPTICAL, Database, calibration, encoded
+from rtabmap_database import OPTICAL, Database, calibration, encoded, rvl
 
 from taichi_mrf.geometry.poses import inverse
 
@@ -49,12 +41,16 @@ WHOLE_NUMBERS: dict[str, Callable[[Path, Content], Path]] = {
 
 
 def write_database(folder: Path, content: Content) -> Path:
-    """A database of RTAB-Map, whose poses are of a body."""
+    """A database of RTAB-Map, optimised, whose poses are of a body; each second depth image is packed."""
     path = folder.with_suffix(".db")
     database = Database(path)
-    for i, image in enumerate(content.depth):
-        T_world_body = content.poses[i] @ inverse(OPTICAL)
-        database.add(i + 1, 100.0 + i, T_world_body, encoded(image), calibration(CAMERA))
+    bodies = {i: T @ inverse(OPTICAL) for i, T in enumerate(content.poses, start=1)}
+    for i, T in bodies.items():
+        depth, color = (encoded, rvl)[i % 2](content.depth[i - 1]), encoded(content.color[i - 1])
+        database.add(i, 99.0 + i, T, depth, calibration(CAMERA), color)
+    database.optimise(bodies)
+    database.link(1, 2, 0, inverse(bodies[1]) @ bodies[2], np.eye(6))
+    database.connection.close()
     return path
 
 

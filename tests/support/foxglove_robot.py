@@ -2,14 +2,13 @@
 
 import base64
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import foxglove
 from foxglove import messages as m
+from heard import SECONDS, Sender
 from rosbags.highlevel import AnyReader
 
 from taichi_mrf.datasets.wires.client import wait_until
@@ -32,19 +31,14 @@ class Listener:
 
 
 @dataclass
-class Robot:
-    """``messages`` are (topic, time of recording in nanoseconds, bytes) in order. In ``own``, protobuf or
-    json, they are Foxglove's own types in that encoding."""
+class Robot(Sender):
+    """In ``own``, protobuf or json, messages are Foxglove's own types in that encoding."""
 
-    bag: Path
-    port: int
     own: str = ""
     listener: Listener = field(default_factory=Listener)
-    sent: int = 0
 
     def __post_init__(self) -> None:
         self.context = foxglove.Context()
-        self.messages: list[tuple[str, int, bytes]] = []
         self.channels: dict[str, Any] = {}
         with AnyReader([self.bag]) as reader:
             kind, encoding = ("ros2msg", "cdr") if reader.is2 else ("ros1msg", "ros1")
@@ -68,7 +62,7 @@ class Robot:
 
     def start(self) -> None:
         """Listen, at the same port as before once the system lets go of it."""
-        assert wait_until(self._starts, 20), f"port {self.port} is in use"
+        assert wait_until(self._starts, SECONDS), f"port {self.port} is in use"
 
     def _starts(self) -> bool:
         try:
@@ -84,35 +78,21 @@ class Robot:
         self.server.stop()
         self.listener.topics.clear()
 
-    def wait_for(self, *topics: str) -> None:
-        """Wait until somebody has subscribed to some topics."""
-        assert wait_until(lambda: set(topics) <= set(self.listener.topics), 20), self.listener.topics
+    def listened(self) -> set[str]:
+        return set(self.listener.topics)
+
+    def put(self, topic: str, time_ns: int, data: bytes) -> None:
+        self.channels[topic].log(data, log_time=time_ns)
 
     def send(self, *topics: str) -> None:
         """Send all messages, or those of some topics."""
-        for topic, time, data in self.messages:
-            if not topics or topic in topics:
-                self.channels[topic].log(data, log_time=time)
+        for each in self.messages:
+            if not topics or each[0] in topics:
+                self.put(*each)
 
     def send_again(self, topic: str) -> None:
         """Send the first message of a topic as one of this moment."""
         self.channels[topic].log(next(data for name, _, data in self.messages if name == topic))
-
-    def send_next(self, count: int) -> None:
-        """Send the next messages in the order of recording, as many as there are."""
-        for topic, time, data in self.messages[self.sent : self.sent + count]:
-            self.channels[topic].log(data, log_time=time)
-        self.sent += count
-
-
-@contextmanager
-def robot(bag: Path, port: int = 0, own: str = "") -> Iterator[Robot]:
-    """A robot that runs in the ``with`` block."""
-    found = Robot(bag, port, own)
-    try:
-        yield found
-    finally:
-        found.stop()
 
 
 OWN = {

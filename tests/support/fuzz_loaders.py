@@ -20,7 +20,6 @@ import numpy as np
 from bag_clouds import write as write_clouds
 from datasets_recordings import (
     CAMERA,
-    FORMATS,
     INTRINSIC,
     Content,
     arrays,
@@ -31,8 +30,8 @@ from datasets_recordings import (
     write_numbered,
     write_record3d,
     write_seven_scenes,
-    write_stray,
 )
+from every_format import EVERY
 from inputs_bags import Bag, plain, write_bag
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
@@ -42,7 +41,6 @@ from point_clouds import write_scans as write_lidar_scans
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from rtabmap_database import Database, calibration, encoded, rvl
 from stereo_rig import write as write_stereo_file
 from stereo_rig import write_kitti
 
@@ -51,6 +49,7 @@ from taichi_mrf.calibration.truth_sources import read_stamps
 from taichi_mrf.config.schema import Config, VolumeConfig, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.formats.frames_npz import FramesNpz
 from taichi_mrf.datasets.formats.rtabmap import RtabmapRecording
 from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
@@ -101,7 +100,7 @@ def frames_of(dataset: Dataset) -> bytes:
             refused.append((name, str(error)))
             continue
         assert frame.depth_m.shape == frame.camera.shape
-        own_cameras = isinstance(dataset, RtabmapRecording)
+        own_cameras = isinstance(dataset, RtabmapRecording | FramesNpz)
         if isinstance(frame.camera, PinholeCamera) and not frame.sensor and not own_cameras:
             assert frame.camera == dataset.camera
         assert frame.depth_m.dtype == np.float32
@@ -227,11 +226,11 @@ def _parts(open_file: Callable[[Path], object], *names: str, finite: str = "") -
 
 
 def _at(name: str, write: Callable[[Path], object]) -> Callable[[Path], Path]:
-    """Writes a file or folder of this name, or into the folder itself if it is empty."""
+    """Writes a file or folder of this name, perhaps with a suffix; into the folder itself if it is empty."""
 
     def make(folder: Path) -> Path:
-        write(folder / name)
-        return folder / name
+        written = write(folder / name)
+        return written if isinstance(written, Path) else folder / name
 
     return make
 
@@ -344,16 +343,6 @@ def _yaml(path: Path) -> None:
     path.write_text("\n".join(x for x in text.splitlines() if "#" not in x))
 
 
-def _rtabmap_file(path: Path) -> None:
-    database = Database(path)
-    for i in range(CONTENT.count):
-        depth = (rvl, encoded)[i % 2](CONTENT.depth[i])
-        database.add(i + 1, float(i), CONTENT.poses[i], depth, calibration(CAMERA), encoded(CONTENT.color[i]))
-    database.optimise({i + 1: T for i, T in enumerate(CONTENT.poses)})
-    database.link(1, 2, 0, CONTENT.poses[0], np.eye(6))
-    database.connection.close()
-
-
 K_TXT = "14 0 7.5\n0 15 5.5\n0 0 1"
 CAMERA_YAML = "width: 16\nheight: 12\nfx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\n"
 TABLES = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
@@ -383,15 +372,13 @@ _plan = _parts(lambda path: read_floor_plan(path, (4.0, 3.0)), "wall", "pixel_x_
 
 LOADERS = [
     *(
-        Loader(name, _at("recording", partial(each.write, content=CONTENT)), _dataset)
-        for name, each in FORMATS.items()
+        Loader(name, _at("recording", partial(write, content=CONTENT)), _dataset)
+        for name, write in EVERY.items()
     ),
     Loader("7-Scenes, camera.yaml", _at("", partial(_with_camera, "camera.yaml", CAMERA_YAML)), _dataset),
     Loader("7-Scenes, intrinsics.txt", _at("", partial(_with_camera, "intrinsics.txt", K_TXT)), _dataset),
     Loader("Open3D JSON", _at("", _open3d), _dataset),
-    Loader("Stray Scanner", _at("", partial(write_stray, content=CONTENT)), _dataset),
-    Loader("Record3D", _at("walk", _record3d), _dataset),
-    Loader("Record3D .r3d", _at("walk.r3d", partial(write_record3d, content=CONTENT)), _dataset),
+    Loader("Record3D, folder", _at("walk", _record3d), _dataset),
     Loader("frames npz", _at("walk.npz", partial(write_npz, values=arrays(CONTENT))), _dataset, sealed=True),
     Loader("frames npz, folder", _at("", _npz_folder), _dataset, sealed=True),
     Loader("KITTI stereo", write_kitti, _dataset),
@@ -449,7 +436,6 @@ LOADERS = [
     ),
     Loader("pose stream", _file("poses.txt", STREAM), _parts(read_timed_poses, "stamps", "poses")),
     Loader("pose graph", _file("graph.g2o", GRAPH), _pose_graph),
-    Loader("RTAB-Map database", _at("walk.db", _rtabmap_file), _dataset),
     Loader(
         "stamps",
         _file("stamps.txt", "0.5 a.png\n1.5 b.png\n"),

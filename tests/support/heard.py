@@ -1,6 +1,9 @@
-"""What a client of a robot's wire hears, and what a recording made of it shows: frames that are the bag's."""
+"""A robot that sends a bag, what a client of its wire hears, and frames made of it, which are the bag's."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -14,6 +17,54 @@ from taichi_mrf.datasets.wires.client import Client, Raw, wait_until
 from taichi_mrf.sensor.frame import Frame
 
 SECONDS = 20
+
+
+@dataclass
+class Sender:
+    """A robot that runs in a ``with`` block, and is stopped at its end; its kind says how it sends.
+    ``messages`` are (topic, time of recording in nanoseconds, bytes) in order."""
+
+    bag: Path
+    port: int = 0
+    messages: list[tuple[str, int, bytes]] = field(default_factory=list, init=False)
+    sent: int = field(default=0, init=False)
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        raise NotImplementedError
+
+    def listened(self) -> set[str]:
+        """The topics that somebody listens to."""
+        raise NotImplementedError
+
+    def put(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Send one message."""
+        raise NotImplementedError
+
+    def wait_for(self, *topics: str) -> None:
+        """Wait until somebody listens to some topics."""
+        assert wait_until(lambda: set(topics) <= self.listened(), SECONDS), self.listened()
+
+    def send_next(self, count: int) -> None:
+        """Send the next messages in the order of recording, as many as there are."""
+        for each in self.messages[self.sent : self.sent + count]:
+            self.put(*each)
+        self.sent += count
+
+    @contextmanager
+    def sending(self, count: int, *topics: str) -> Iterator[None]:
+        """It sends its next messages in the meantime, once somebody listens to some topics."""
+        thread = Thread(target=lambda: (self.wait_for(*topics), self.send_next(count)))
+        thread.start()
+        try:
+            yield
+        finally:
+            thread.join()
 
 
 def heard(client: Client, count: int) -> list[Raw]:
@@ -31,16 +82,8 @@ def heard(client: Client, count: int) -> list[Raw]:
 def begun(sender: Any, first: int, query: str = "", listen_to: str = "/odom", color: bool = False) -> Dataset:
     """The dataset of a robot that has sent its first messages while it was listened to."""
 
-    def send() -> None:
-        sender.wait_for(listen_to)
-        sender.send_next(first)
-
-    thread = Thread(target=send)
-    thread.start()
-    try:
+    with sender.sending(first, listen_to):
         return open_dataset(sender.source + query, color=color)
-    finally:
-        thread.join()
 
 
 def whole(live: Dataset) -> stream.Robot:
@@ -69,9 +112,15 @@ def follow_bag(sender: Any, live: Dataset, bag: Path, count: int) -> None:
         assert wait_until(lambda: not live.awaiting(), SECONDS)
         sender.send_next(1)
         ours, theirs = live.read(number), recorded.read(number)
-        assert (ours.name, ours.stamp, ours.camera) == (theirs.name, theirs.stamp, theirs.camera)
-        np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
-        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+        assert ours.camera == theirs.camera
+        assert_same_frame(ours, theirs)
+
+
+def assert_same_frame(ours: Frame, theirs: Frame, named: bool = True) -> None:
+    """Bit for bit; of a name and stamp too unless one is numbered otherwise."""
+    assert not named or (ours.name, ours.stamp) == (theirs.name, theirs.stamp)
+    for part in ("depth_m", "no_return", "points_m", "sigma_m", "color", "T_world_camera"):
+        np.testing.assert_array_equal(getattr(ours, part), getattr(theirs, part))
 
 
 def has_heard(live: Dataset, count: int) -> bool:

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from taichi_mrf.alignment.se3 import moved
+from taichi_mrf.calibration.chessboard import camera_matrix
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -60,13 +61,17 @@ class Bag:
         self.kind, self.writer, self.types = kind, writer, types_of(kind)
         self.connections: dict[str, Any] = {}
 
-    def send(self, topic: str, name: str, stamp: float, **fields: Any) -> None:
-        """Record a message of a type such as sensor_msgs/msg/Image."""
+    def send(self, topic: str, name: str, stamp: float, frame: str | None = None, **fields: Any) -> None:
+        """Record a message of a type such as sensor_msgs/msg/Image, with a header if it has a frame."""
+        if frame is not None:
+            fields["header"] = self.header(stamp, frame)
+        self.record(topic, name, stamp, self.message(name, **fields))
+
+    def record(self, topic: str, name: str, stamp: float, message: Any) -> None:
         key = topic + self.node
         if key not in self.connections:
             node = {"callerid": self.node} if self.node else {}
             self.connections[key] = self.writer.add_connection(topic, name, typestore=self.types, **node)
-        message = self.message(name, **fields)
         serialize = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
         self.writer.write(self.connections[key], nanoseconds(stamp + self.latency), serialize(message, name))
 
@@ -99,27 +104,20 @@ class Bag:
         data = image.astype(image.dtype.newbyteorder(">" if big else "<")).view(np.uint8).reshape(height, -1)
         padded = np.pad(data, ((0, 0), (0, 4)))
         self.send(
-            topic, "sensor_msgs/msg/Image", stamp, header=self.header(stamp, frame), height=height,
-            width=width, encoding=encoding, is_bigendian=int(big), step=padded.shape[1],
-            data=padded.reshape(-1),
+            topic, "sensor_msgs/msg/Image", stamp, frame, height=height, width=width, encoding=encoding,
+            is_bigendian=int(big), step=padded.shape[1], data=padded.reshape(-1),
         )  # fmt: skip
 
     def compressed(self, topic: str, stamp: float, frame: str, image: NDArray, words: str) -> None:
         """A CompressedImage of a file; ``words`` is its format. Three channels are RGB."""
         suffix = ".jpg" if "jpeg" in words else ".png"
         data = cv2.imencode(suffix, image[..., ::-1] if image.ndim == 3 else image)[1].reshape(-1)
-        name = "sensor_msgs/msg/CompressedImage"
-        self.send(topic, name, stamp, header=self.header(stamp, frame), format=words, data=data)
+        self.send(topic, "sensor_msgs/msg/CompressedImage", stamp, frame, format=words, data=data)
 
     def compressed_depth(
-        self,
-        topic: str,
-        stamp: float,
-        frame: str,
-        image: NDArray,
-        kind: str = "16UC1",
+        self, topic: str, stamp: float, frame: str, image: NDArray, kind: str = "16UC1",
         packing: str = "compressedDepth png",
-    ) -> None:
+    ) -> None:  # fmt: skip
         """A CompressedImage as image_transport's compressedDepth plugin writes it; 32FC1 from metres."""
         scale, offset = 0.0, 0.0
         if kind == "32FC1":  # depth_quantization 100, depth_max 10 m: the plugin's own defaults
@@ -128,46 +126,37 @@ class Bag:
                 image = np.where(image > 0, np.rint(scale / image + offset), 0).astype(np.uint16)
         packed = rvl(image) if "rvl" in packing else cv2.imencode(".png", image)[1].tobytes()
         data = np.frombuffer(struct.pack("<iff", 0, scale, offset) + packed, np.uint8)
-        name, words = "sensor_msgs/msg/CompressedImage", f"{kind}; {packing}"
-        self.send(topic, name, stamp, header=self.header(stamp, frame), format=words, data=data)
+        words = f"{kind}; {packing}"
+        self.send(topic, "sensor_msgs/msg/CompressedImage", stamp, frame, format=words, data=data)
 
     def camera_info(
-        self,
-        topic: str,
-        frame: str,
-        camera: PinholeCamera,
-        distortion: tuple[float, ...] = (),
-        model: str = "plumb_bob",
-        projection: PinholeCamera | None = None,
-        stamp: float = 0.0,
-        binning: tuple[int, int] = (0, 0),
-        part: tuple[int, int, int, int] = (0, 0, 0, 0),
-    ) -> None:
+        self, topic: str, frame: str, camera: PinholeCamera, distortion: tuple[float, ...] = (),
+        model: str = "plumb_bob", projection: PinholeCamera | None = None, stamp: float = 0.0,
+        binning: tuple[int, int] = (0, 0), part: tuple[int, int, int, int] = (0, 0, 0, 0),
+    ) -> None:  # fmt: skip
         """A CameraInfo; ``projection`` is that of the rectified images, ``part`` the region of interest as x,
         y, width and height."""
         roi = dict(zip(("x_offset", "y_offset", "width", "height"), part, strict=True))
-        P = np.column_stack([matrix(projection or camera), np.zeros(3)])
-        arrays = {"d": distortion or [0.0] * 5, "k": matrix(camera), "r": np.eye(3), "p": P}
+        P = np.column_stack([camera_matrix(projection or camera), np.zeros(3)])
+        arrays = {"d": distortion or [0.0] * 5, "k": camera_matrix(camera), "r": np.eye(3), "p": P}
         self.send(
-            topic, "sensor_msgs/msg/CameraInfo", stamp, header=self.header(stamp, frame), roi=roi,
-            height=camera.height, width=camera.width, distortion_model=model,
-            binning_x=binning[0], binning_y=binning[1],
+            topic, "sensor_msgs/msg/CameraInfo", stamp, frame, roi=roi, height=camera.height,
+            width=camera.width, distortion_model=model, binning_x=binning[0], binning_y=binning[1],
             **{name.upper() if self.kind == "ros1" else name: np.ravel(v) for name, v in arrays.items()},
         )  # fmt: skip
 
     def odometry(self, topic: str, stamp: float, frame: str, child: str, T: Pose) -> None:
-        header, pose = self.header(stamp, frame), {"pose": pose_of(T)}
-        self.send(topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id=child, pose=pose)
+        pose = {"pose": pose_of(T)}
+        self.send(topic, "nav_msgs/msg/Odometry", stamp, frame, child_frame_id=child, pose=pose)
 
     def pose_stamped(self, topic: str, stamp: float, frame: str, T: Pose) -> None:
-        name = "geometry_msgs/msg/PoseStamped"
-        self.send(topic, name, stamp, header=self.header(stamp, frame), pose=pose_of(T))
+        self.send(topic, "geometry_msgs/msg/PoseStamped", stamp, frame, pose=pose_of(T))
 
     def path(self, topic: str, stamp: float, frame: str, poses: Mapping[float, Pose]) -> None:
         """All poses of a body so far, by their stamps."""
         name = "geometry_msgs/msg/PoseStamped"
         each = [self.message(name, header=self.header(s, frame), pose=pose_of(T)) for s, T in poses.items()]
-        self.send(topic, "nav_msgs/msg/Path", stamp, header=self.header(stamp, frame), poses=each)
+        self.send(topic, "nav_msgs/msg/Path", stamp, frame, poses=each)
 
     def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
         """A transform; of a matrix of zeros, with a quaternion of zeros."""
@@ -213,11 +202,6 @@ def rvl(image: NDArray[np.uint16]) -> bytes:
     return struct.pack(f"<II{len(words)}I", image.shape[1], image.shape[0], *words)
 
 
-def matrix(camera: PinholeCamera) -> NDArray[np.float64]:
-    """The 3 x 3 matrix of a camera."""
-    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-
-
 @contextmanager
 def writing(path: Path, kind: Kind) -> Iterator[Bag]:
     """A new bag: a .bag file for ros1, else the folder of a ROS 2 bag."""
@@ -257,6 +241,10 @@ def steps(i: int) -> np.ndarray:
     return image
 
 
+def metres(i: int) -> np.ndarray:
+    return steps(i).astype(np.float32) / 1000
+
+
 T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
 
@@ -277,15 +265,10 @@ def stamp(i: float) -> float:
 
 
 def images(
-    bag: Bag,
-    topic: str = TOPIC,
-    info: bool = True,
-    frame: str = FRAME,
-    image: Callable[[int], NDArray] = steps,
-    encoding: str = "16UC1",
-    late: float = 0.0,
+    bag: Bag, topic: str = TOPIC, info: bool = True, frame: str = FRAME,
+    image: Callable[[int], NDArray] = steps, encoding: str = "16UC1", late: float = 0.0,
     numbers: Sequence[int] = range(COUNT),
-) -> None:
+) -> None:  # fmt: skip
     """Images, with the CameraInfo that goes with their topic."""
     if info:
         bag.camera_info(topic.rpartition("/")[0] + "/camera_info", frame, CAMERA)
@@ -294,27 +277,18 @@ def images(
 
 
 def odometry(
-    bag: Bag,
-    topic: str = "/odom",
-    child: str = BODY,
-    T: Pose = EYE,
-    late: float = 0.0,
+    bag: Bag, topic: str = "/odom", child: str = BODY, T: Pose = EYE, late: float = 0.0,
     numbers: Sequence[float] = range(COUNT),
-) -> None:
+) -> None:  # fmt: skip
     """The path of a body that starts at T, as Odometry."""
     for i in numbers:
         bag.odometry(topic, stamp(i) + late, "odom", child, T @ world_body(i))
 
 
 def moving_tf(
-    bag: Bag,
-    parent: str = "odom",
-    T: Pose = EYE,
-    child: str = BODY,
-    topic: str = "/tf",
-    late: float = 0.0,
+    bag: Bag, parent: str = "odom", T: Pose = EYE, child: str = BODY, topic: str = "/tf", late: float = 0.0,
     numbers: Sequence[float] = range(COUNT),
-) -> None:
+) -> None:  # fmt: skip
     """The path of a body that starts at T, as transforms."""
     for i in numbers:
         bag.tf(topic, stamp(i) + late, parent, child, T @ world_body(i))
@@ -327,11 +301,7 @@ def stamped_poses(bag: Bag, topic: str, frame: str = "map", T_body_own: Pose = E
 
 
 def mounted(
-    bag: Bag,
-    parent: str = BODY,
-    child: str = FRAME,
-    T: Pose = T_body_camera,
-    topic: str = "/tf_static",
+    bag: Bag, parent: str = BODY, child: str = FRAME, T: Pose = T_body_camera, topic: str = "/tf_static"
 ) -> None:
     """A transform that is fixed: where the camera is on the body."""
     bag.tf(topic, 0.0, parent, child, T)
@@ -342,6 +312,18 @@ def plain(bag: Bag) -> None:
     odometry(bag)
     mounted(bag)
 
+
+BETWEEN = np.arange(-0.5, COUNT).tolist()
+"""Poses half a step before and after each image."""
+
+WAYS: dict[str, Callable[[Bag], object]] = {
+    "odometry": partial(odometry, numbers=BETWEEN),
+    "tf": partial(moving_tf, numbers=BETWEEN),
+}
+IMAGES: dict[str, Callable[[Bag], object]] = {
+    "16UC1": images,
+    "32FC1": partial(images, image=metres, encoding="32FC1"),
+}
 
 CONFIDENCE = "/camera/confidence/image_rect_raw"
 
@@ -371,14 +353,9 @@ UP = TILT.T @ [0.0, -1.0, 0.0]
 
 
 def imu(
-    bag: Bag,
-    topic: str = IMU,
-    tf: bool = True,
-    covariance: float = 0.0,
-    shake: float = 0.0,
-    seconds: float = 0.8,
-    latency: float = 0.05,
-) -> None:
+    bag: Bag, topic: str = IMU, tf: bool = True, covariance: float = 0.0, shake: float = 0.0,
+    seconds: float = 0.8, latency: float = 0.05,
+) -> None:  # fmt: skip
     """An IMU beside a camera that turns at RATE and does not move, from 0.8 s on at 200 Hz."""
     bag.latency = latency
     if tf:
@@ -390,7 +367,7 @@ def imu(
         at = 0.8 + k / 200
         force = to_imu @ (GRAVITY * UP) + random.normal(0, shake + 1e-6, 3)
         bag.send(
-            topic, "sensor_msgs/msg/Imu", at, header=bag.header(at, LINK), orientation={"w": 1.0},
+            topic, "sensor_msgs/msg/Imu", at, LINK, orientation={"w": 1.0},
             angular_velocity=axes("xyz", to_imu @ RATE), angular_velocity_covariance=unknown,
             linear_acceleration=axes("xyz", force),
         )  # fmt: skip
@@ -398,11 +375,7 @@ def imu(
 
 
 def check_poses(
-    dataset: Dataset,
-    T_fixed: Pose = EYE,
-    mount: Pose = T_body_camera,
-    count: int = COUNT,
-    atol: float = 1e-9,
+    dataset: Dataset, T_fixed: Pose = EYE, mount: Pose = T_body_camera, count: int = COUNT, atol: float = 1e-9
 ) -> None:
     """Its frames are at the body's poses, seen from a fixed frame, and mounted so."""
     assert len(dataset) == count

@@ -1,12 +1,14 @@
-"""Frames in memory as a recording, and a pose some time before or after another."""
+"""Frames in memory as a recording or written as one, and a pose some time before or after another."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taichi_mrf.calibration.chessboard import camera_matrix
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -32,6 +34,15 @@ class Frames(Dataset):
 
 def of_frames(frames: Sequence[Frame], name: str = "frames", **options: Any) -> Frames:
     return Frames(name, frames[0].camera, frames=frames, **options)
+
+
+def write_frames(path: Path, frames: Sequence[Frame], stamped: bool = False) -> Path:
+    """An .npz of depth and poses, perhaps with stamps, in a folder that is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fields = ("depth_m", "T_world_camera", *(["stamp"] if stamped else []))
+    arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in fields}
+    np.savez(path, K=camera_matrix(frames[0].camera), **arrays)
+    return path
 
 
 def moved(T_world_body: Pose, displacement: Sequence[float], turn: Sequence[float], sign: float) -> Pose:

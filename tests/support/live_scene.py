@@ -5,14 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import small_room
+from inputs_frames import Frames, of_frames
 
 from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import FrameError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.session.replay import Replay
 from taichi_mrf.session.session import Session
 from taichi_mrf.session.session_core import Policy
@@ -108,25 +107,9 @@ def map_voxels(m: OccupancyMap, min_probability: float = 0.5) -> set[tuple[int, 
     return set(map(tuple, np.floor(centres / m.voxel_size).astype(int).tolist()))
 
 
-@dataclass
-class RoomFrames(Dataset):
+def room(count: int = 4, broken: tuple[int, ...] = ()) -> Frames:
     """The first frames of the small room; those in ``broken`` cannot be read."""
-
-    count: int = 4
-    broken: tuple[int, ...] = ()
-
-    @property
-    def frame_names(self) -> list[str]:
-        return [f"room {index}" for index in range(self.count)]
-
-    def read(self, index: int) -> Frame:
-        if index in self.broken:
-            raise FrameError(f"{self.frame_names[index]}: the image is damaged")
-        return small_room.frames()[index]
-
-
-def room(count: int = 4, broken: tuple[int, ...] = ()) -> RoomFrames:
-    return RoomFrames("small room", small_room.frames()[0].camera, count=count, broken=broken)
+    return of_frames(small_room.frames()[:count], "small room", broken=broken)
 
 
 def source(dataset: Dataset, config: Config = CONFIG, loop: bool = False, speed: float = 0.0) -> Source:

@@ -4,18 +4,22 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 
-def python(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in a new interpreter."""
-    environment = {**os.environ, **environment}
+def python(
+    *arguments: str | Path, cwd: Path | None = None, before: Any = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a new interpreter with these arguments; ``before`` is called in its process."""
     return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment
-    )
+        [sys.executable, *arguments], capture_output=True, text=True, check=False, cwd=cwd, preexec_fn=before,
+        env={**os.environ, **environment},
+    )  # fmt: skip
 
 
 def output(program: str, **environment: str) -> str:
-    done = python(program, **environment)
+    done = python("-c", program, **environment)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout.strip()

@@ -111,8 +111,7 @@ def map_of(
 @cache
 def frames() -> list[Frame]:
     """Six frames around the room."""
-    dataset = open_dataset("synthetic:room?width=80&height=60&frames=6")
-    return [dataset.read(i) for i in range(len(dataset))]
+    return list(open_dataset("synthetic:room?width=80&height=60&frames=6"))
 
 
 def room(make: Callable[[float], Any], chosen: Sequence[int] = range(6)) -> Any:

@@ -8,8 +8,7 @@ maps the built-in room with voxels of 2 cm, and prints the median of 20 answers.
 import statistics
 from dataclasses import dataclass
 
-from browser import LivePage, chromium
-from live_program import LiveProgram
+from browser import LivePage, chromium, live_page
 
 # One step of the threshold to the right, then one to the left; the clock runs in the page, from the key on
 # the slider's thumb until the sentence with the number of voxels is another one.
@@ -63,11 +62,7 @@ def slider_answers(page: LivePage, count: int) -> list[Answer]:
 
 def main() -> None:
     """Measure, and print what was found."""
-    with (
-        LiveProgram("synthetic:room", "--voxel-size", "0.02") as program,
-        chromium() as browser,
-        LivePage(browser, program.address) as page,
-    ):
+    with chromium() as browser, live_page(browser, "synthetic:room", "--voxel-size", "0.02") as page:
         page.until(lambda seen: seen.activity.startswith("sweeping") and seen.agrees, "inference")
         voxels = page.look().voxels
         answers = [each for each in slider_answers(page, 20) if each.while_inferring]

@@ -24,8 +24,7 @@ VOXEL_SIZE = 0.08
 @cache
 def frames() -> list[Frame]:
     """Ten frames around the room."""
-    dataset = open_dataset("synthetic:room?width=120&height=90&frames=10")
-    return [dataset.read(i) for i in range(len(dataset))]
+    return list(open_dataset("synthetic:room?width=120&height=90&frames=10"))
 
 
 def add(m: BrickMap, frame: Frame, T_world_camera: Pose | None = None) -> int:

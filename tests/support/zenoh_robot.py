@@ -7,18 +7,14 @@ rmw_zenoh's docs and sources, so that the client under test reads nothing that i
 import json
 import socket
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import zenoh
+from heard import Sender
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from zenoh import ext
-
-from taichi_mrf.datasets.wires.client import wait_until
 
 GID = bytes(range(16))
 
@@ -49,24 +45,20 @@ def attached(number: int, time_ns: int) -> bytes:
 
 
 @dataclass
-class Robot:
-    """``messages`` are (topic, time of recording in nanoseconds, bytes) in order. Who publishes on a topic of
-    ``transient`` keeps its last message. ``mode`` is router or peer, or node: a peer behind a router of its
-    own, as rmw_zenoh's are."""
+class Robot(Sender):
+    """Who publishes on a topic of ``transient`` keeps its last message. ``mode`` is router or peer, or node:
+    a peer behind a router of its own, as rmw_zenoh's are."""
 
-    bag: Path
-    port: int
     domain: int = 0
     mode: str = "router"
     transient: tuple[str, ...] = ("/tf_static",)
     scouting: bool = False
     foreign: tuple[str, ...] = ()
     """Topics of a type that only the robot knows."""
-    sent: int = 0
-    messages: list[tuple[str, int, bytes]] = field(default_factory=list)
     types: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.port = self.port or free_port()
         with AnyReader([self.bag]) as reader:
             self.types = {each.topic: each.msgtype for each in reader.connections}
             self.messages = [(each.topic, time, bytes(data)) for each, time, data in reader.messages()]
@@ -136,26 +128,8 @@ class Robot:
             self.router.close()
 
     def listened(self) -> set[str]:
-        """The topics that somebody listens to."""
         return {token.split("/")[9].replace("%", "/") for token in list(self.listeners)}
 
-    def wait_for(self, *topics: str) -> None:
-        """Wait until somebody listens to some topics."""
-        assert wait_until(lambda: set(topics) <= self.listened(), 20), self.listened()
-
-    def send_next(self, count: int) -> None:
-        """Send the next messages in the order of recording, as many as there are."""
-        for topic, time, data in self.messages[self.sent : self.sent + count]:
-            self.numbers[topic] += 1
-            self.publishers[topic].put(data, attachment=attached(self.numbers[topic], time))
-        self.sent += count
-
-
-@contextmanager
-def robot(bag: Path, **settings: Any) -> Iterator[Robot]:
-    """A robot that runs in the ``with`` block."""
-    found = Robot(bag, settings.pop("port", None) or free_port(), **settings)
-    try:
-        yield found
-    finally:
-        found.stop()
+    def put(self, topic: str, time_ns: int, data: bytes) -> None:
+        self.numbers[topic] += 1
+        self.publishers[topic].put(data, attachment=attached(self.numbers[topic], time_ns))

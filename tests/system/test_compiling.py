@@ -1,13 +1,11 @@
 """Words for the time in which a run waits for the compiler of kernels."""
 
 import itertools
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from new_interpreter import python
 
 from taichi_mrf.system import compiler, compiling, runtime
 
@@ -21,14 +19,7 @@ sys.exit(main(["map", "synthetic:room?frames=4", "--no-pictures", "--verbose", "
 
 
 def _map(out: Path, cache: Path) -> str:
-    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(out)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-c", PROGRAM, out, XDG_CACHE_HOME=str(cache))
     assert done.returncode == 0, done.stderr
     return done.stderr
 

@@ -3,12 +3,11 @@
 methods."""
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from new_interpreter import python
 
 import taichi_mrf.system.bundles  # noqa: F401 - hastens the compiler
 from taichi_mrf.system import compiler
@@ -75,5 +74,5 @@ def test_a_program_has_a_kernel_of_its_own_at_its_top(tmp_path: Path) -> None:
         "taichi_mrf.init('cpu')\n"
         "print(own(4.0))\n"
     )
-    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=False)
+    done = python(program)
     assert (done.stdout, done.returncode) == ("8.0\n", 0), done.stderr

@@ -195,7 +195,7 @@ tm.init("cpu", threads=100000)
 tm.MRFMap(0.1).voxels()
 print(len(os.listdir("/proc/self/task")))
 """
-    assert int(python(program).stdout) < 4 * os.cpu_count() + 16  # stderr has the warning
+    assert int(python("-c", program).stdout) < 4 * os.cpu_count() + 16  # stderr has the warning
 
 
 def test_more_threads_than_cores_are_a_warning(caplog: pytest.LogCaptureFixture) -> None:

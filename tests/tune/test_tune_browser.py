@@ -174,6 +174,7 @@ def test_other_frames_begin_anew(page: LivePage) -> None:
     page.tab("Frames")
     page.slide("Count", 6)
     page.press("Use these frames")
+    page.press("Discard them")
     page.until(lambda seen: "4 frames make the map" in page.text(), "the other frames")
     page.until(
         lambda seen: seen.settled and shown_try(page) == 0 and score(page, "keyframes") == 4, "their scores"

@@ -182,6 +182,8 @@ def test_a_search_is_made_and_judged_on_views_that_it_has_not_seen() -> None:
     search = Search(CONFIG, ("inference.surface_density", "sensor.sigma_scale"), 4, seed=0)
     session, link = run(script(), search)
     assert search.told == 4
+    shares = [each.share for each in link.of_type(Activity) if each.text.startswith("search, 3 of 4")]
+    assert 0.5 <= min(shares) < max(shares) <= 0.75  # of the whole search, not of its third map
     assert [frame.name for frame in session.frames.unseen] == ["room-0004"]
     assert {each.by for each in session.history.attempts} == {"start", "search"}
     best = max(link.of_type(Tried), key=lambda each: each.scores.log_likelihood)

@@ -153,7 +153,7 @@ def test_every_colouring_has_a_help_and_one_with_a_scale_a_legend_with_its_ends(
     marks = re.findall("<span>(.*?)</span>", legend_html(scale))
     assert bool(marks) == bool(len(scale.colors))
     if name in ("uncertainty", "keyframes that see it"):
-        assert marks == [f"{scale.low:.3g}", scale.measure.label, f"{scale.high:.3g}"]
+        assert marks == [f"{scale.low:.3g}", f"{scale.measure.label}, log scale", f"{scale.high:.3g}"]
 
 
 def test_up_is_the_axis_that_cameras_hold_upwards() -> None:

@@ -1,5 +1,6 @@
 """The live page without a mapping process and without a browser: what updates and users' actions do."""
 
+import itertools
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,8 +21,8 @@ from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.answer import SWITCHES, beside
 from taichi_mrf.viewer.live.page import Page
-from taichi_mrf.viewer.live.panel import AGREE, COMMANDS, DECLINE, Clicked, Dragged
-from taichi_mrf.viewer.scene.base_panel import Joined, Used
+from taichi_mrf.viewer.live.panel import COMMANDS, Clicked, Dragged
+from taichi_mrf.viewer.scene.base_panel import AGREE, DECLINE, Joined, Used
 from taichi_mrf.viewer.scene.view_options import ViewOptions
 from taichi_mrf.viewer.transport import downloads
 from taichi_mrf.voxels.layers import COLORS
@@ -461,7 +462,6 @@ def test_the_answer_covers_neither_the_click_nor_the_middle_nor_the_panel(width:
 
 
 def test_what_is_selected_is_told_to_the_map_until_the_answer_is_closed(handled: LivePage) -> None:
-    handled.server.scene.reset()
     log_odds = np.full((1, 512), -900, np.int16)
     log_odds[0, 0] = 900  # the voxel at the origin
     none = np.zeros((0, 3), np.int32)
@@ -544,6 +544,21 @@ def camera_of_a_user(handled: LivePage, browser: RawClient) -> viser.CameraHandl
     camera = handled.server.get_clients()[client].camera
     wait_for(lambda: camera.position[0] == 7.0, "the user's viewpoint")
     return camera
+
+
+def test_a_browser_that_tells_late_where_it_was_sent_has_not_been_moved_by_its_user(
+    handled: LivePage, browser: RawClient
+) -> None:
+    client = handled.client_id()
+    handled.take(Joined(client))
+    camera, viewpoint = handled.server.get_clients()[client].camera, handled.page.viewpoint
+    viewpoint.map_grew(np.zeros(3), np.ones(3))
+    first = camera.position.copy()
+    viewpoint.map_grew(np.zeros(3), np.full(3, 3.0))
+    browser.say(camera_message(position=first.tolist()))  # it has not heard of the second place yet
+    wait_for(lambda: np.allclose(camera.position, first), "the first place")
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0))
+    assert np.linalg.norm(camera.position) > 2.0 * np.linalg.norm(first)
 
 
 def take_both_maps(handled: LivePage) -> None:
@@ -680,6 +695,18 @@ def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: LivePage)
     handled.take(m.CurrentCamera("a scan", np.eye(4), lidar))
     handled.page.keyframes.clear()
     assert nodes(handled) == set()
+
+
+def test_the_view_is_fitted_again_when_more_of_the_same_box_is_seen(handled: LivePage) -> None:
+    viewpoint, start = handled.page.viewpoint, handled.server.initial_camera
+    corners = np.array(list(itertools.product((0.0, 9.0), repeat=3)))
+    few = np.concatenate([np.full((1000, 3), 4.5), corners])  # nearly all of them in the middle
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0), lambda: few, 1000)
+    near = np.linalg.norm(start.position - 4.5)
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0), lambda: corners, 1240)
+    assert np.linalg.norm(start.position - 4.5) == near
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0), lambda: corners, 1250)
+    assert np.linalg.norm(start.position - 4.5) > 1.5 * near
 
 
 def test_a_browser_begins_behind_the_camera_that_is_followed(handled: LivePage) -> None:

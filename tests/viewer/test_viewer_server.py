@@ -18,6 +18,7 @@ import raw_viewer_client
 import rich
 import viser
 from live_program import wait_for
+from new_interpreter import python
 from raw_viewer_client import camera_message, raw_client
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
@@ -402,7 +403,7 @@ with raw_client(server.get_port()) as client:
 @pytest.mark.parametrize("ending", ["server.stop()", ""], ids=["stopped", "left to the interpreter's exit"])
 def test_it_prints_nothing(ending: str) -> None:
     script = QUIET_SCRIPT.format(tests=str(Path(raw_viewer_client.__file__).parent), ending=ending)
-    finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    finished = python("-c", script)
     assert (finished.returncode, finished.stdout, finished.stderr) == (0, "", "")
 
 

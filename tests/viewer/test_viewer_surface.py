@@ -241,6 +241,13 @@ def test_while_a_map_has_no_surface_the_panel_says_voxels_and_why() -> None:
         running.take(HELLO, DONE)  # another map, which has one
         assert [widget.value for widget in shown] == ["surface", "height"]
         assert "There is no surface" not in widgets["draw_as"].hint
+        widgets["baseline"].value = True
+        running.take(DONE)
+        assert [widget.value for widget in shown] == ["voxels", "marginal probability"]
+        assert "both maps are drawn alike" in widgets["draw_as"].hint
+        widgets["baseline"].value = False
+        running.take(DONE)
+        assert [widget.value for widget in shown] == ["surface", "height"]
         widgets["color_by"].value = "uncertainty"
         running.take(replace(DONE, no_surface="all images are gone"))
         assert [widget.value for widget in shown] == ["voxels", "uncertainty"]
@@ -269,7 +276,11 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     scale = drawn.page.map.scale if drawn.page.map else None
     assert scale is not None
     # The standard deviations are 0.1, 0.2, 0.3 and 1 cm; equal ratios are equal steps.
-    assert (scale.low, scale.high, scale.measure.label) == (0.1, 1.0, "uncertainty: standard deviation (cm)")
+    assert (scale.low, scale.high, scale.measure.label) == (
+        0.1,
+        1.0,
+        "uncertainty: standard deviation (cm)",
+    )
     expected = scale.colors[np.rint(255 * np.log10([1, 2, 3, 10])).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
     drawn.draw(shade=False)

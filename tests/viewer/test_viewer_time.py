@@ -190,14 +190,25 @@ def test_scrubbing_shows_how_far_the_camera_had_come_and_what_it_saw(running: Ti
         assert (path.colors[:, 0] == path.colors[:, 1]).all()
         return path.colors[:, 0]
 
+    def seen() -> list[bool]:
+        """True for each keyframe that is drawn."""
+        frusta = (running.server.scene.get_handle_by_name(f"/keyframes/{id}") for id in range(3))
+        return [frustum.visible for frustum in frusta if frustum is not None]
+
     assert (steps()[0] == steps()[1]).all()
+    assert seen() == [True, True, True]
     past = steps()[0]
     running.move_to(4.0)
+    assert seen() == [True, True, False]
+    running.page.keyframes.choose(2)  # which draws it anew
+    assert seen() == [True, True, False]
     assert (steps()[0] == past).all()
     assert (steps()[1] != past).any()
-    assert "view 1, of 3.0 s" in running.time._list.content
+    assert ">nearest keyframe: view 1, at 3.0 s<" in running.time._list.content
+    assert "width:160px" in running.time._list.content
     running.move_to(4.9)
-    assert "view 2, of 6.0 s" in running.time._list.content
+    assert "view 2, at 6.0 s" in running.time._list.content
     running.span(6.0)
+    assert seen() == [True, True, True]
     assert (steps() == past).all()
     assert not running.time._list.visible

@@ -1,6 +1,7 @@
 """Views of the map from the page's buttons: what is seen fills the part of the window beside the panel."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +25,13 @@ MIDDLE_M = np.array([2.4, 1.6, 0.8])
 @pytest.fixture
 def handled() -> Iterator[HandledPage]:
     running = HandledPage(Page, HELLO)
+    take_box(running)
+    yield running
+    running.server.stop()
+
+
+def take_box(running: HandledPage) -> None:
+    """Show the box, and a speck far away from it."""
     running.page.viewpoint.set_up((2, 1))
     solid = np.full((len(BRICKS), 512), 900, np.int16), np.ones((len(BRICKS), 512), np.uint8)
     speck = np.full((1, 512), -900, np.int16)
@@ -31,8 +39,6 @@ def handled() -> Iterator[HandledPage]:
     running.take(m.Bricks("map", BRICKS, *solid, BRICKS[:0]))
     running.take(m.Bricks("map", np.array([[0, 100, 0]], np.int32), speck, solid[1][:1], BRICKS[:0]))
     running.page._flush()
-    yield running
-    running.server.stop()
 
 
 def lens(browser: RawClient) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
@@ -118,6 +124,77 @@ def test_the_nearest_eye_that_sees_all_but_the_farthest_specks(covered: float, f
     low, high = np.quantile(seen[:, 0], [0.005, 0.995])  # across, where these points are long
     assert high - low == pytest.approx(2 * (1 - covered), rel=0.1)
     assert high + low == pytest.approx(-2 * covered, abs=0.05)
+
+
+def shown_shares(
+    points: NDArray[np.float64], lens: tuple[NDArray[np.float64], NDArray[np.float64], float], aspect: float
+) -> NDArray[np.float64]:
+    """Where points (n, 3) are seen in the window, as shares (n, 2) from its lower left corner."""
+    eye, target, fov = lens
+    towards = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross((0, 0, 1), towards) / np.linalg.norm(np.cross((0, 0, 1), towards))
+    x, y, z = np.stack([right, np.cross(towards, right), towards]) @ (points - eye).T
+    return 0.5 + 0.5 * np.stack([x / (-z * aspect), y / -z], axis=1) / np.tan(fov / 2)
+
+
+@pytest.mark.parametrize(("width", "height", "right", "foot"), [(1280, 800, 0.27, 0.1), (390, 844, 0, 0.45)])
+@pytest.mark.parametrize("side", ["Home", "Top", "Side", "Fit"])
+def test_what_is_seen_stands_above_what_covers_the_foot_of_the_window(
+    handled: HandledPage, width: int, height: int, right: float, foot: float, side: str
+) -> None:
+    """The strip of time in a wide window, the open panel on a phone. *Home* is the first view here."""
+    handled.take(replace(HELLO, has_dates=True))
+    take_box(handled)
+    with raw_client(handled.server.get_port()) as browser:
+        browser.say(camera_message(image_width=width, image_height=height, position=[9, -5, 6]))
+        wait_for(lambda: len(handled.server.get_clients()) == 1, "the client")
+        client = next(iter(handled.server.get_clients()))
+        handled.page.actions[side](client)
+        camera = handled.server.get_clients()[client].camera
+        given = camera.position, camera.look_at, camera.fov
+    places = shown_shares(handled.page.map.seen_points(), given, width / height)
+    inside = ((places > (0, foot)) & (places < (1 - right, 1))).all(axis=1)
+    assert inside.mean() > 0.98
+    filled = np.ptp(places[inside], axis=0) / (1 - right, 1 - foot)
+    assert filled.max() > 0.85
+
+
+def test_home_is_the_opening_view_after_the_baseline_has_come_and_gone(handled: HandledPage) -> None:
+    up, light = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    handled.take(m.SurfaceView(np.array([-1.0, 9.2, 6.3]), MIDDLE_M, up, light, 0.7, False))
+    start, homes = handled.server.initial_camera, []
+    opening = np.array(start.position), np.array(start.look_at)
+    one = BRICKS[:1], np.full((1, 512), 900, np.int16), np.ones((1, 512), np.uint8)
+    with raw_client(handled.server.get_port()) as browser:
+        browser.say(camera_message(image_width=1280, image_height=800))
+        wait_for(lambda: len(handled.server.get_clients()) == 1, "the client")
+        for change in ((*one, BRICKS[:0]), (BRICKS[:0], one[1][:0], one[2][:0], BRICKS[:1])):
+            handled.take(m.Bricks("baseline", *change))
+            handled.page.map.look_changed()
+            handled.page._flush()
+            client = next(iter(handled.server.get_clients()))
+            handled.page.actions["Home"](client)
+            camera = handled.server.get_clients()[client].camera
+            homes.append((camera.position, camera.look_at))
+    assert not np.allclose(homes[0], opening)  # both maps
+    np.testing.assert_allclose(homes[1], opening, atol=1e-6)
+
+
+def test_the_width_of_squares_is_told_by_the_panel_alone(handled: HandledPage) -> None:
+    assert handled.server.scene.get_handle_by_name("/ground") is not None
+    assert handled.server.scene.get_handle_by_name("/ground/square") is None
+    handled.page.show_counts()
+    assert "m squares" in handled.page.panel._shown.content
+
+
+def test_a_gizmo_can_be_grasped_on_a_large_map(handled: HandledPage) -> None:
+    T, crossed, picture = np.eye(4), np.zeros((0, 3), np.int32), np.zeros((2, 2, 3), np.uint8)
+    camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+    handled.take(m.KeyframeInfo(0, "view", T, camera, 1, "on", picture, crossed, T))
+    handled.page.actions["Move"](0)
+    assert handled.page.keyframes.gizmo.scale == pytest.approx(0.05 * 81, rel=0.02)  # the speck is 80 m away
+    low, high = BOX_M
+    assert handled.page.keyframes.grab((low, high)).scale == 0.5
 
 
 def test_a_single_voxel_can_be_looked_at() -> None:

@@ -13,9 +13,7 @@ from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.answer import SWITCHES, VoxelAnswer, beside, facts_of, facts_of_many
 from taichi_mrf.viewer.live.panel import (
-    AGREE,
     CHOSEN_KEYFRAME,
-    DECLINE,
     POSITION_STEP_M,
     RECORD,
     SPEEDS,
@@ -84,8 +82,6 @@ class Page(BasePage[Panel]):
             "Undo": lambda client: ask(m.Undo()),
             "Redo": lambda client: ask(m.Undo(again=True)),
             "Recording": self._choose_recording,
-            AGREE: self.panel.agree,
-            DECLINE: self.panel.close_question,
             "Keyframe": lambda client: self._choose(self.panel.chosen_keyframe()),
             "On/off": lambda client: self._edit(lambda k: m.Switch(k.id, None)),
             "All off": lambda client: self._switch_range(False),
@@ -139,6 +135,7 @@ class Page(BasePage[Panel]):
             self.viewpoint.start_over()
         self.begin_map(hello)
         self._hello, self._in_photo = hello, False
+        self.viewpoint.has_strip = hello.has_dates
         self.answer.clear()
         change(self.panel.unsaved, visible=False)
         self.keyframes.clear()
@@ -179,8 +176,7 @@ class Page(BasePage[Panel]):
         if self.map is None:
             return
         self.map.surface.take_view(view)
-        if not self._with_baseline:
-            self.viewpoint.look_as_pictured(view)
+        self.viewpoint.look_as_pictured(view, self.map.surface.vertices())
         if view.photo and not self._in_photo:
             self._in_photo = True
             self.panel.show_in_photo_colors()
@@ -247,7 +243,7 @@ class Page(BasePage[Panel]):
 
     def _reset(self, client: int) -> None:
         """Ask before a map with keyframes is deleted."""
-        self._request(
+        self.request(
             client,
             m.Reset(),
             bool(self.keyframes.keyframes),
@@ -264,7 +260,7 @@ class Page(BasePage[Panel]):
         chosen = self.panel.recording.value
         self.panel.show_recording(self._hello)
         if chosen != self.panel.recording.value:
-            self._request(
+            self.request(
                 client,
                 m.Reset(self._hello.recordings.index(chosen)),
                 self.panel.unsaved.visible,
@@ -278,7 +274,7 @@ class Page(BasePage[Panel]):
         """Ask before the chosen keyframe is frozen."""
         chosen = self._changeable()
         if chosen is not None:
-            self._request(
+            self.request(
                 client,
                 m.Freeze(chosen.id),
                 True,
@@ -288,14 +284,6 @@ class Page(BasePage[Panel]):
                 "Freeze it",
                 "Leave it as it is",
             )
-
-    def _request(self, client: int, request: m.Request, asks: bool, *question: str) -> None:
-        """Send a request; if it ``asks``, once its user has agreed to a question: title, text, yes, no."""
-        handle = self.server.get_clients().get(client)
-        if not asks:
-            self.ask(request)
-        elif handle is not None:
-            self.panel.ask(handle, lambda: self.ask(request), *question)
 
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)
@@ -341,7 +329,7 @@ class Page(BasePage[Panel]):
         if self.keyframes.gizmo is not None:
             self.keyframes.release()
         elif self._changeable() is not None:
-            gizmo = self.keyframes.grab()
+            gizmo = self.keyframes.grab(None if self.map is None else self.map.box_m())
             gizmo.on_update(
                 lambda event: (
                     None if event.phase == "update" else self.inbox.put(Dragged(event.phase == "start"))

@@ -1,6 +1,6 @@
 """The widgets of the live page."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -76,8 +76,6 @@ measured on four recordings, of which none is a third off."""
 POINT_BYTES, TRIANGLE_BYTES = 26, 29
 """Bytes of a voxel in voxels.ply, and of a triangle with its share of vertices in mesh.ply."""
 SPEEDS = {"as fast as possible": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
-AGREE, DECLINE = "agree", "decline"
-"""Actions of the answers to a question."""
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
@@ -93,7 +91,6 @@ class Panel(BasePanel):
         self._all = (0.0, 0.0)
         self._rays, self._voxels, self._colored = 0, 0, False
         self._thumbnail_of: NDArray[np.uint8] | None = None
-        self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         hint = "Map another recording of this folder; unsaved changes are asked about first."
         self.recording = self.watch(gui.add_dropdown("Recording", [""], visible=False, hint=hint))
         self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
@@ -195,7 +192,9 @@ class Panel(BasePanel):
         if h.has_surface:
             past = "" if past_s is None else "it is made of the map of now, and this is an earlier time"
             later = "it is made at the end, or while paused" if moving or not status.voxels else ""
-            self.show_lack_of_surface(status.no_surface or past or later)
+            both = self.view_options.handles["baseline"].value
+            alike = "the baseline has none, and both maps are drawn alike" if both else ""
+            self.show_lack_of_surface(status.no_surface or past or later or alike)
         if status.voxels:
             self.offer_colorings(h, status.layers)
         coming = h.has_frames and not status.finished  # else there is nothing to play
@@ -288,31 +287,6 @@ class Panel(BasePanel):
         title, score = ("", "") if images is None else (images.title, images.score)
         now = "" if self.time.past_s is None else "\n\nof the map as it is now"
         self._score.content = f"**{in_markdown(title)}**\n\n{in_markdown(score)}{now}" if title else ""
-
-    def ask(
-        self, client: viser.ClientHandle, then: Callable[[], None], title: str, text: str, yes: str, no: str
-    ) -> None:
-        """Ask one user to confirm what cannot be undone, which ``then`` does. The answers are actions, for
-        :meth:`agree` and :meth:`close_question`."""
-        self.close_question(client.client_id)
-        modal = client.gui.add_modal(title)
-        self._questions[client.client_id] = modal, then
-        with modal:
-            client.gui.add_markdown(text)
-            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, AGREE))
-            client.gui.add_button(no).on_click(lambda event: self.used(event, DECLINE))
-
-    def close_question(self, client: int) -> None:
-        """Close the question."""
-        modal, _ = self._questions.pop(client, (None, None))
-        if modal is not None and not modal.closed:
-            modal.close()
-
-    def agree(self, client: int) -> None:
-        """Close the question, and do what was asked."""
-        _, then = self._questions.get(client, (None, lambda: None))
-        self.close_question(client)
-        then()
 
     def _keyframe_tab(self) -> None:
         gui = self.gui

@@ -99,11 +99,11 @@ class TimeStrip:
         start_s = 0.0 if self._span is None else self._span.start_s
         near, lines, picture = self._nearest, [_in_words(change, start_s) for change in self._latest], ""
         if near is not None:
-            lines = [f"keyframe {near.id}, {near.name}, of {near.stamp_s - start_s:.1f} s", *lines]
-            picture = image_html(near.picture, "height:5em")
+            lines = [f"nearest keyframe: {near.name}, at {near.stamp_s - start_s:.1f} s", *lines]
+            picture = image_html(near.picture, "width:160px;max-width:40%;align-self:start")
         self._list.visible = bool(lines)
         items = "".join(f"<div>{in_html(line)}</div>" for line in lines)
-        style = "display:flex;gap:1em;padding:0 0.75em 0.75em;font-size:0.8em;max-height:7em;overflow:auto"
+        style = "display:flex;gap:1em;padding:0 0.75em 0.75em;font-size:0.8em;max-height:11em;overflow:auto"
         self._list.content = f'<div style="{style}">{picture}<div>{items}</div></div>'
 
 

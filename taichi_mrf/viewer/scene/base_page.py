@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer import messages as m
-from taichi_mrf.viewer.scene.base_panel import BasePanel, Inbox, Item, Joined, OptionsMoved, Used
+from taichi_mrf.viewer.scene.base_panel import (
+    AGREE,
+    DECLINE,
+    BasePanel,
+    Inbox,
+    Item,
+    Joined,
+    OptionsMoved,
+    Used,
+)
 from taichi_mrf.viewer.scene.coloring import Scale, key_html, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.map_scene import MapScene
@@ -73,6 +82,8 @@ class BasePage(Generic[P]):
         self._cut_for_space = False  # whether the cut was made to show free space
         self.actions: dict[str, Callable[[int], None]] = {
             BasePanel.DARK_OR_LIGHT[0]: self._turn_colors,
+            AGREE: panel.agree,
+            DECLINE: panel.close_question,
             **{side.capitalize(): partial(self.look_from, side) for side in get_args(Side)},
         }
         """Function of each action, given the client that asked for it."""
@@ -116,15 +127,27 @@ class BasePage(Generic[P]):
         if self.map is not None:
             self.map.clear()
         self.map = MapScene(self.server, hello)
-        self.server.gui.set_panel_label(f"taichi_mrf: {Path(hello.source.partition('?')[0]).name}"[:60])
+        self.show_source(hello.source)
+
+    def show_source(self, source: str) -> None:
+        """Name the recording at the head of the panel."""
+        self.server.gui.set_panel_label(f"taichi_mrf: {Path(source.partition('?')[0]).name}"[:60])
 
     def look_from(self, side: Side, client: int) -> None:
-        """Show all that is seen of the map to one client, or else of its keyframes."""
+        """Show all that is seen of the map to one client, or else of its keyframes; or the opening view."""
         points = np.zeros((0, 3)) if self.map is None else self.map.seen_points()
         if not len(points) and (self.options.keyframes or self.options.path):
             points = self.keyframes.roster.path()[0].reshape(-1, 3)
-        if len(points):
+        if len(points) or side == "home":
             self.viewpoint.look_from(client, side, points)
+
+    def request(self, client: int, request: m.Request, asks: bool, *question: str) -> None:
+        """Send a request; if it ``asks``, once its user has agreed to a question: title, text, yes, no."""
+        handle = self.server.get_clients().get(client)
+        if not asks:
+            self.ask(request)
+        elif handle is not None:
+            self.panel.ask(handle, lambda: self.ask(request), *question)
 
     def notify(self, notice: m.Notice) -> None:
         """Show a notice in the list, and for some seconds in every browser."""
@@ -196,10 +219,10 @@ class BasePage(Generic[P]):
         self._show_used(self.map)
         if self.map.has_baseline != self._with_baseline:
             self._with_baseline = self.map.has_baseline
-            self.viewpoint.look_at_everything()
+            self.viewpoint.look_beside(self._with_baseline)
         box = self.map.box_m()
         if box is not None:
-            self.viewpoint.map_grew(*box)
+            self.viewpoint.map_grew(*box, self.map.seen_points, self.map.voxels)
         in_cut = self.options.free_space and not self.map.has_baseline
         shown = self.map.scale, in_cut, self.map.shows_changes
         if shown != self._explained:

@@ -66,6 +66,9 @@ class Inbox(queue.SimpleQueue[Item]):
 
 Tell = Callable[[Event], None]
 
+AGREE, DECLINE = "agree", "decline"
+"""Actions of the answers to a question."""
+
 _MOST_NOTICES = 8
 
 _COUNTED = {
@@ -88,6 +91,7 @@ class BasePanel:
         self.gui, self._tell = gui, tell
         self.view_options = OptionWidgets(gui, ViewOptions(), lambda: tell(OptionsMoved()))
         self._notices: list[Notice] = []
+        self._questions: dict[int, tuple[Any, Callable[[], None]]] = {}
         self._activity = gui.add_html(_activity_html("Starting …"))
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
 
@@ -186,6 +190,31 @@ class BasePanel:
         """Empty the list."""
         self._notices.clear()
         self._notice_list.content = notices_html([])
+
+    def ask(
+        self, client: viser.ClientHandle, then: Callable[[], None], title: str, text: str, yes: str, no: str
+    ) -> None:
+        """Ask one user to confirm what cannot be undone, which ``then`` does. The answers are actions, for
+        :meth:`agree` and :meth:`close_question`."""
+        self.close_question(client.client_id)
+        modal = client.gui.add_modal(title)
+        self._questions[client.client_id] = modal, then
+        with modal:
+            client.gui.add_markdown(text)
+            client.gui.add_button(yes, color="red").on_click(lambda event: self.used(event, AGREE))
+            client.gui.add_button(no).on_click(lambda event: self.used(event, DECLINE))
+
+    def close_question(self, client: int) -> None:
+        """Close the question."""
+        modal, _ = self._questions.pop(client, (None, None))
+        if modal is not None and not modal.closed:
+            modal.close()
+
+    def agree(self, client: int) -> None:
+        """Close the question, and do what was asked."""
+        _, then = self._questions.get(client, (None, lambda: None))
+        self.close_question(client)
+        then()
 
     def used(self, event: Any, action: str) -> None:
         """Callback of what a user does with viser's widgets."""

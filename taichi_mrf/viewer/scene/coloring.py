@@ -244,7 +244,7 @@ def pale(color: ArrayLike) -> NDArray[np.uint8]:
 
 def legend_html(scale: Scale) -> str:
     """The scale as a strip with numbers, for the page."""
-    label = scale.measure.label
+    label = scale.measure.label + ", log scale" * scale.measure.logarithmic
     if not len(scale.colors):
         said = f'<div style="padding:0 0.75em;font-size:0.85em">{label}</div>' if label else ""
         return said + _swatches(dict(scale.measure.key))

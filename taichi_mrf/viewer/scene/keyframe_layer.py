@@ -25,6 +25,9 @@ FRUSTUM_M = 0.075
 RING_M = 0.2
 """Radius of the rings of a lidar, whose maps are of larger places, metres."""
 
+_GIZMO_M, _GIZMO_OF_MAP = 0.5, 0.05
+"""Least length of a gizmo's arrows, metres, and their length over the diagonal of a large map."""
+
 MOST_FROZEN = 50
 MOST_WAYPOINTS = 2000
 LEAST_TO_MERGE = 4096
@@ -159,10 +162,18 @@ class KeyframeLayer:
                 self._draw(self.keyframes[id])
 
     def show_until(self, stamp_s: float | None) -> None:
-        """Highlight the camera's path up to a time; None: all of it."""
+        """Highlight the camera's path up to a time, and hide the keyframes after it and the camera of now;
+        None: all of it."""
         if stamp_s != self._until_s:
             self._until_s = stamp_s
             self.draw_path()
+            self._show_path()
+            for id in self._places:
+                shown = self._is_until(self.keyframes[id])
+                change(self._scene.get_handle_by_name(self._name(id)), visible=shown)
+
+    def _is_until(self, keyframe: KeyframeInfo) -> bool:
+        return self._until_s is None or keyframe.stamp_s <= self._until_s
 
     def draw_path(self) -> None:
         """Draw the camera's path through all keyframes, in the order of their numbers."""
@@ -179,18 +190,21 @@ class KeyframeLayer:
         self._show_path()
 
     def _show_path(self) -> None:
-        for name in ("/path", "/camera"):
+        for name, shown in (("/path", self._path), ("/camera", self._path and self._until_s is None)):
             node = self._scene.get_handle_by_name(name)
             if node is not None:
-                change(node, visible=self._path)
+                change(node, visible=shown)
 
-    def grab(self) -> viser.TransformControlsHandle:
-        """Put a gizmo on the chosen keyframe. There must be one."""
+    def grab(self, map_m: ArrayLike | None) -> viser.TransformControlsHandle:
+        """Put a gizmo on the chosen keyframe. There must be one. ``map_m`` (2, 3) are the lowest and highest
+        corner of the map, which the gizmo grows with."""
         self.release()
         assert self.chosen is not None
         wxyz, position = placement(self.keyframes[self.chosen].T_world_camera)
+        across_m = 0.0 if map_m is None else float(np.linalg.norm(np.ptp(map_m, axis=0)))
+        length_m = max(_GIZMO_M, _GIZMO_OF_MAP * across_m)
         self.gizmo = self._scene.add_transform_controls(
-            "/gizmo", scale=0.5, depth_test=False, wxyz=wxyz, position=position
+            "/gizmo", scale=length_m, depth_test=False, wxyz=wxyz, position=position
         )
         return self.gizmo
 
@@ -240,6 +254,7 @@ class KeyframeLayer:
             thickness=3.0 if is_chosen else 1.5,
             picture=picture if flat else None,
         )
+        change(self._scene.get_handle_by_name(name), visible=self._is_until(keyframe))
         if flat or picture is None or picture.shape[:2] != keyframe.camera.shape:
             self._scene.remove_by_name(f"{name}/picture")
         else:

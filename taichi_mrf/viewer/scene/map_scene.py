@@ -117,6 +117,11 @@ class MapScene:
         every = np.concatenate(corners)
         return every.min(axis=0), every.max(axis=0)
 
+    @property
+    def voxels(self) -> int:
+        """Number of voxels of all maps that are shown or stand behind a surface."""
+        return sum(layer.voxels_shown for layer in self.layers.values())
+
     def counts(self) -> dict[str, int]:
         """How many of what is shown, or will be once everything has been sent, by name; ``voxels`` of the map
         also while its surface is shown in their place."""
@@ -374,7 +379,7 @@ def square_m(extent_m: float) -> float:
 
 
 class Ground:
-    """Owns the grid in the scene, and the label with the width of its squares: ``square_m``, None without."""
+    """Owns the grid in the scene; its squares are ``square_m`` wide, None without a grid."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
@@ -409,9 +414,6 @@ class Ground:
             fade_strength=0.0,
             position=place,
         )
-        corner = square * first
-        corner[up[0]] = height_m
-        self._scene.add_label("/ground/square", f"squares of {square:g} m", position=corner - place)
 
     def hide(self) -> None:
         """Remove the grid from the scene."""

@@ -127,6 +127,10 @@ class SurfaceLayer:
         self._prepared = dict.fromkeys(self._shown)
         self.send(visible=False)
 
+    def vertices(self) -> NDArray[np.float64]:
+        """All vertices (n, 3) in metres, world, shown or not."""
+        return np.concatenate([np.zeros((0, 3)), *(patch.vertices_m for patch in self.patches.values())])
+
     def points(self) -> NDArray[np.float64]:
         """The vertices (n, 3) that are shown, in metres, world."""
         shown = [

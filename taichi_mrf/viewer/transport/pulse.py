@@ -123,6 +123,9 @@ style.textContent = `
   [style*="padding-bottom: 0.5em"] { padding-bottom: 0.3em !important; }  /* all layers without scrolling */
   p:has(> label[for]) { color: inherit !important; }  /* grey on grey else */
   [style*="width: 3rem"] { width: 3.75rem !important; }  /* six figures beside a slider */
+  div:has(> .mantine-Slider-markWrapper:nth-child(4)) .mantine-Slider-mark {  /* lines: many dots merge */
+    width: 1px !important; height: 0.75rem; border: 0; border-radius: 0; background: #868e96;
+    transform: translateY(-0.2rem) !important; }
   [role=tab][aria-selected=true] { color: light-dark(#1971c2, #4dabf7) !important; }
   [role=tablist]:has(> [data-dock-tab]:only-child) { display: none !important; }  /* the name of one tab */
   @media (max-width: 36em) {

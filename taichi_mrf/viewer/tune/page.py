@@ -52,10 +52,10 @@ class TunePage(BasePage[TunePanel]):
             KnobMoved: lambda moved: self._knob_moved(moved.name),
         }
         self.actions |= {
-            "Start a search": lambda client: ask(self.panel.search.value()),
+            "Start a search": lambda client: self._begin_anew(client, self.panel.search.value),
             "Save best.yaml": lambda client: ask(t.SaveTries("best", 0, client)),
             "Stop the search": lambda client: ask(t.StopSearch()),
-            "Use these frames": lambda client: self._choose_frames(),
+            "Use these frames": lambda client: self._begin_anew(client, self._frames),
             "Held-out view": lambda client: self._look_at(self.panel.view.value),
             "Restore": lambda client: self._with_try(self._restore),
             "Pin": lambda client: self._with_try(lambda number: ask(t.Pin(number))),
@@ -73,12 +73,13 @@ class TunePage(BasePage[TunePanel]):
             self._table_old = False
 
     def _begin(self, tuning: t.Tuning) -> None:
-        """Start with an empty table."""
+        """Start with an empty table; other frames of the same recording keep the user's view."""
+        self._has_view &= self._tuning is not None and tuning.source == self._tuning.source
         self._tuning, self._config = tuning, tuning.config
         self._tries.clear()
-        self._has_view = False
         self._shown = self._pinned = None
         self._moved, self._table_old, self._asked = False, True, None
+        self.show_source(tuning.source)
         self.panel.show_tuning(tuning)
         self.panel.show_config(tuning.config)
 
@@ -157,11 +158,26 @@ class TunePage(BasePage[TunePanel]):
         self._config, self._moved = self._tries[number].config, True
         self.panel.show_config(self._config)
 
-    def _choose_frames(self) -> None:
+    def _frames(self) -> t.ChooseFrames:
+        return t.ChooseFrames(self.panel.frames.value())
+
+    def _begin_anew(self, client: int, wanted: Callable[[], m.Request]) -> None:
+        """Ask before the tries that were made are lost with the table."""
         try:
-            self.ask(t.ChooseFrames(self.panel.frames.value()))
+            request = wanted()
         except ConfigError as error:
             self.notify(m.Notice(str(error), "error"))
+            return
+        self.request(
+            client,
+            request,
+            len(self._tries) > 1,
+            "Discard the tries?",
+            f"This empties the table of {len(self._tries)} tries, because scores on other frames are not "
+            "comparable. To keep them, save the table first.",
+            "Discard them",
+            "Keep the tries",
+        )
 
     def _look_at(self, name: str) -> None:
         if self._tuning is not None and name in self._tuning.held_out:

@@ -272,8 +272,8 @@ def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) 
         key=lambda each: each.scores.log_likelihood,
         default=None,
     )
-    kinds = t.headline(one_size(tries))
-    head = "".join(f'<th style="text-align:right;font-weight:500">{name}</th>' for name in kinds)
+    kinds = t.headline(one_size(tries)).values()
+    head = "".join(f'<th style="text-align:right;font-weight:500">{kind.label}</th>' for kind in kinds)
     rows = [f'<tr style="opacity:0.65"><th></th>{head}</tr>']
     for each in list(tries)[: -MOST_TRIES - 1 : -1]:
         marks = "▸" if each.number == shown else ""
@@ -282,7 +282,7 @@ def table_html(tries: Sequence[t.Tried], shown: int | None, pinned: int | None) 
         about = "~" if each.scores.pixel_stride > 1 else ""
         numbers = "".join(
             f'<td style="text-align:right;white-space:nowrap">{about}{kind.text(each.scores)}</td>'
-            for kind in kinds.values()
+            for kind in kinds
         )
         shade = "background:rgba(0,114,178,0.12);" if each.number == shown else ""
         rows.append(

@@ -138,6 +138,7 @@ def _change(kind: ScoreKind, scores: Scores, before: Scores | None, spread: floa
     text = kind.difference(kind.value(scores), kind.value(before))
     if not float(text.replace(",", "")):
         return _cell("same")
+    text = f"{text} {kind.unit}".rstrip()
     if abs(difference) <= _SAME * spread or kind.better == "neither":
         return _cell(text)
     word, color = ("better", _GOOD) if (difference > 0) == (kind.better == "higher") else ("worse", _BAD)

@@ -48,14 +48,12 @@ def room(one_backend: None) -> list[Frame]:
 
 @cache
 def rendered() -> list[Frame]:
-    dataset = open_dataset("synthetic:room?frames=24&width=160&height=120", color=False)
-    return [dataset.read(i) for i in range(len(dataset))]
+    return list(open_dataset("synthetic:room?frames=24&width=160&height=120", color=False))
 
 
 @cache
 def kitchen(folder: Path) -> list[Frame]:
-    dataset = open_dataset(folder / "seven_scenes_redkitchen", color=False)
-    return [dataset.read(i) for i in range(len(dataset))]
+    return list(open_dataset(folder / "seven_scenes_redkitchen", color=False))
 
 
 def broken(frames: Sequence[Frame], *names: str) -> Sequence[Frame]:
