@@ -1,5 +1,5 @@
-"""The exceptions that the library raises, and what it warns of. Only the command line turns them into
-messages and exit codes."""
+"""The exceptions and warnings of the library. Only the command line turns them into messages and exit
+codes."""
 
 import warnings
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ class DatasetError(TaichiMRFError):
 
 
 class ReadWrongError(DatasetError):
-    """A recording is certainly misread; the text says what contradicts, and which command corrects it."""
+    """A recording is certainly misread; the text names the contradiction and the command that corrects it."""
 
 
 class FrameError(DatasetError):

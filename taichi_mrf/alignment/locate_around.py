@@ -70,14 +70,14 @@ def found_around(
     fit = best.end.equations.fit
     reason = ""
     if fit < RULES.least_fit:
-        reason = f"{100 * fit:.0f}% of its points fit the map where it fits best, of all places around"
+        reason = f"{100 * fit:.0f}% of its points fit the map at the best of all places around"
     elif best.end.directions < 6:
         reason = f"its points determine {best.end.directions} of the six directions of its pose"
     elif best.through > RULES.scan_most_through:
         reason = f"it looks through {100 * best.through:.0f}% of the map where it fits best"
     elif others and others[0].worth > best.worth - RULES.clearly * around.spread_m:
         apart_rad, apart_m = tangent_norms(best.end.T_world_camera, others[0].end.T_world_camera)
-        reason = f"it fits alike at two places, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
+        reason = f"it fits two places equally well, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
     return best.end, reason
 
 

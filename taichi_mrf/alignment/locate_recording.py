@@ -98,7 +98,7 @@ def locate_stretch(scan: Scan, whole: WholeMap, T_map_recording: Pose | None = N
     (4, 4), it is looked for only near there."""
     if scan.views < RULES.whole_fewest:
         needed = RULES.whole_fewest
-        return LocatedRecording(None, f"too little seen: {scan.views} views, and {needed} are needed")
+        return LocatedRecording(None, f"too little seen: {scan.views} views, but {needed} are needed")
     if len(scan.points.points) < LEAST_POINTS or len(whole.planes.points_m) < LEAST_POINTS:
         return LocatedRecording(None, "too little seen: hardly any point lies on a smooth surface")
     # 1. Every heading at every place near the map's cameras.
@@ -185,7 +185,7 @@ class PlaceCheck:
         self._is_doubtful = True
         return (
             f"the recording may have been located in a wrong place: its first {self._keyframes} keyframes "
-            f"look through {share:.0%} of what the map has there, and {self._most:.0%} at most are usual; or "
+            f"look through {share:.0%} of what the map has there (usually at most {self._most:.0%}); or "
             "its poses drift, or much has been moved since"
         )
 

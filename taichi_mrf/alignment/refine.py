@@ -91,7 +91,7 @@ class Aligner:
         outcome = replace(outcome, pixels=fits[best].matched, overlap=fits[best].overlap)
         if outcome.overlap < config.min_overlap:
             share = f"{100 * outcome.overlap:.0f}% of its points lie near what others have measured"
-            return replace(outcome, reason=f"{share}, and {100 * config.min_overlap:.0f}% are needed")
+            return replace(outcome, reason=f"{share}, but {100 * config.min_overlap:.0f}% are needed")
         lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
         found = aligned(levels, begin, Recorded(begin, config), lever_m)
         before = levels[-1].linearised(start)

@@ -1,4 +1,4 @@
-"""What is searched for in a whole map: points as if one sensor had seen them all at once.
+"""The query of a search in a whole map: points as if one sensor had seen them all at once.
 
 They are from a few frames of a recording. A map of which only voxels are left is searched for by its surface,
 around places in its free space: depth images rendered of it would have steps where voxels have faces, and few

@@ -59,7 +59,7 @@ class Sightlines:
         return _share(*self.counts(surface, T_world_camera))
 
     def counts(self, surface: Planes, T_world_camera: Pose) -> tuple[int, int]:
-        """How many cells of the surface it looks through, and how many it sees."""
+        """Number of surface cells that it looks through, and number that it sees."""
         points = (surface.points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         ranges_m = np.linalg.norm(points, axis=1)
         counts = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
@@ -88,7 +88,7 @@ def looked_through(surface: Planes, image: DepthImage, T_world_camera: Pose) -> 
 
 
 def through_and_seen(surface: Planes, image: DepthImage, T_world_camera: Pose) -> tuple[int, int]:
-    """How many cells of a mapped surface an image of any sensor looks through, and how many it sees."""
+    """Number of cells of a mapped surface that any sensor's image looks through, and number that it sees."""
     if sees_around(image.camera):
         return Sightlines.of(image).counts(surface, T_world_camera)
     return _counts_of_camera(surface, image, T_world_camera)

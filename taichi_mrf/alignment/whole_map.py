@@ -20,10 +20,10 @@ from taichi_mrf.queries.voxel_map import VoxelMap
 
 @dataclass(frozen=True)
 class WholeMap:
-    """What a map shows of its world: its ``surface``, the ``walls`` that several of its keyframes have
-    measured, which nothing can look through, the places ``cameras_m`` (N, 3) of its keyframes, and ``up``
-    (3,), upwards in its world to 45 degrees. ``is_free`` tells of points (N, 3), in metres, which lie in free
-    space, (N,), and ``colors`` their colours (N, 4) with weights. ``most_through`` is the share of the walls
+    """A map's view of its world: its ``surface``; the ``walls``, measured by several of its keyframes, which
+    no ray can pass; the positions ``cameras_m`` (N, 3) of its keyframes; and ``up`` (3,), the upward
+    direction, to within 45 degrees. ``is_free`` says which points (N, 3), in metres, lie in free space,
+    (N,), and ``colors`` gives their colours (N, 4) with weights. ``most_through`` is the share of the walls
     that a camera's images may look through."""
 
     surface: Surfels
@@ -64,9 +64,9 @@ class WholeMap:
 
 
 def map_of_voxels(m: VoxelMap) -> WholeMap:
-    """What the voxels of a map show whose keyframes' images are gone: as its surface the occupied ones beside
-    free space, all of which are walls, with the direction of that space for a normal; as places of cameras
-    whatever is free."""
+    """The view from the voxels alone, for a map whose keyframe images are gone. The surface is the occupied
+    voxels beside free space: all are walls, and their normals point into that space. Any free place is a
+    camera position."""
     marginals, voxel_m, up = m.marginals, m.voxel_size, m.up
     assert up is not None
 
@@ -98,8 +98,8 @@ def map_of_voxels(m: VoxelMap) -> WholeMap:
 
 
 def walls_of(surface: Surfels, parts: Sequence[Surfels]) -> Planes:
-    """What cannot be looked through of a map's surface: cells in which more than one of its ``parts``, those
-    of its keyframes, have measured something. RULES.whole_walls of them, evenly, if there are more."""
+    """The opaque part of a map's surface: cells that more than one of its ``parts``, one per keyframe, has
+    measured. At most RULES.whole_walls of them, evenly chosen."""
     keys, number = np.unique(np.concatenate([part.keys for part in parts]), return_counts=True)
     rows = np.flatnonzero(np.isin(surface.keys, keys[number > 1]))
     some = np.linspace(0, len(rows) - 1, min(len(rows), RULES.whole_walls)).astype(np.int64)

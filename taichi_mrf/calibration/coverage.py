@@ -1,4 +1,4 @@
-"""Which parts of the view frustum the samples cover, and sentences that name the gaps."""
+"""Coverage of the view frustum by the samples, and sentences that name the gaps."""
 
 from dataclasses import dataclass
 

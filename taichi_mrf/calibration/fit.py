@@ -97,7 +97,7 @@ def _check_enough(covered: NDArray[np.bool_], counts: NDArray[np.int64], options
     if bins < needed:
         raise DatasetError(
             f"too few samples: {int(counts.sum()):,} pixels have measured and true depth from "
-            f"{options.min_depth:g} to {options.max_depth:g} m, and they fill only {bins} depth bins of "
+            f"{options.min_depth:g} to {options.max_depth:g} m, but they fill only {bins} depth bins of "
             f"{options.bin_width:g} m with {options.least_count} in one patch; a polynomial of degree "
             f"{options.degree} needs {needed}"
         )
@@ -211,7 +211,7 @@ def calibrate(
         raise DatasetError(f"none of the {len(source.names)} depth images contains a measurement")
     if histograms.samples == 0:
         raise DatasetError(
-            f"in none of {len(source.names)} images a pixel has both measured and true depth from "
+            f"no pixel of the {len(source.names)} images has both measured and true depth from "
             f"{options.min_depth:g} to {options.max_depth:g} m"
         )
     moments = Moments(cells, histograms.limits())

@@ -240,7 +240,7 @@ def _rounded(value: float) -> float:
 
 
 def _held_out(result: MappingResult, frames: Dataset) -> list[Explained]:
-    """How well the map explains each frame that was held out."""
+    """Fit of the map to each held-out frame."""
     parts = []
     for index in result.held_out:
         try:

@@ -99,8 +99,8 @@ def estimate_lag(
         )
     if best.correlation < options.least_correlation:
         raise DatasetError(
-            "the board does not move in the images as in motion capture: their speeds correlate by no more "
-            f"than {best.correlation:.2f}, at a lag of {best.seconds:.3f} s"
+            "the board's motion in the images does not match motion capture: their speeds correlate by no "
+            f"more than {best.correlation:.2f}, at a lag of {best.seconds:.3f} s"
         )
     return best
 

@@ -71,7 +71,7 @@ class MotionCaptureConfig:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """How bias and sigma are learnt (MRFMap, section IV-C). Depths are axial depth in metres."""
+    """Learning of bias and sigma (MRFMap, section IV-C). Depths are axial depth in metres."""
 
     patch: int = 20
     """Side in pixels of the square patches, each of which gets its own polynomials."""

@@ -113,7 +113,7 @@ def _load(path: Path) -> NDArray:
     except (OSError, ValueError) as error:
         if path.suffix != ".npz":
             raise DatasetError(f"{path}: cannot be read as an array: {said(error)}") from error
-        with open_npz(path, DatasetError, "an array that can be read") as file:
+        with open_npz(path, DatasetError, "a readable array") as file:
             names = file.names
             name = STACK_NAME if STACK_NAME in names else names[0] if len(names) == 1 else None
             if name is None:

@@ -29,7 +29,7 @@ _QUARTILES_PER_SIGMA = 1.349
 
 @dataclass(frozen=True)
 class Cells:
-    """How pixels and depths fall into cells; cell = patch * bins + bin, patches row by row."""
+    """Division of pixels and depths into cells; cell = patch * bins + bin, patches row by row."""
 
     camera: PinholeCamera
     options: CalibrationConfig

@@ -66,7 +66,7 @@ class BenchRun:
 
     def leave_out(self, peer: str) -> None:
         """Say that a peer is not installed."""
-        self.console.print_line(f"{peer} is left out: pip install 'taichi-mrf[bench]' brings it.")
+        self.console.print_line(f"{peer} is left out: pip install 'taichi-mrf[bench]' adds it.")
 
 
 def measure_stages(run: BenchRun) -> Measured:

@@ -78,7 +78,7 @@ def _camera(options: Calibrate, depth: DepthFiles) -> tuple[PinholeCamera, list[
     if options.camera is not None:
         width, height, *intrinsics = options.camera
         if not (width.is_integer() and height.is_integer()):
-            raise DatasetError(f"--camera: the image size {width} x {height} is not in whole pixels")
+            raise DatasetError(f"--camera: the image size {width} x {height} is not a whole number of pixels")
         given = PinholeCamera(int(width), int(height), *intrinsics)
     height_px, width_px = depth.read(depth.names[0]).shape
     scale = width_px / PRIMESENSE.width

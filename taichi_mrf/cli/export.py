@@ -74,11 +74,11 @@ def _check_names(options: Export) -> None:
             raise ConfigError(f"{path}: is named twice")
         folder = _nearest_folder(path)
         if not is_folder(folder):
-            raise MapFileError(f"{path}: cannot be written: {folder} is no folder")
+            raise MapFileError(f"{path}: cannot be written: {folder} is not a folder")
         if not os.access(folder, os.W_OK):
             raise MapFileError(f"{path}: cannot be written: Permission denied")
         if exists(path) and not is_file(path) and path.suffix != SUFFIX:
-            raise MapFileError(f"{path}: cannot be written: it is no regular file")
+            raise MapFileError(f"{path}: cannot be written: it is not a regular file")
 
 
 def _staging(path: Path) -> "tempfile.TemporaryDirectory[str]":
@@ -142,7 +142,7 @@ def _layer(m: OccupancyMap, options: Export) -> VoxelMap:
         stamp_s += m.now_s if stamp_s < 0 else 0.0
         if stamp_s < first_s and not (can_freeze(m) and m.frozen):
             raise ConfigError(
-                f"--at {options.at:g}: {options.map} has no keyframe of that time; "
+                f"--at {options.at:g}: {options.map} has no keyframe at that time; "
                 f"they are from {first_s:.10g} to {m.now_s:.10g} s"
             )
     return m.layer(options.layer, stamp_s)

@@ -146,7 +146,7 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
     except DatasetError as error:
         if bag is None:
             raise
-        console.print_line(f"It cannot be mapped like this: {error}")
+        console.print_line(f"It cannot be mapped as it is: {error}")
         for name in bag.sources:
             if bag.flags or name != source:  # that has just been refused, and the error says what it needs
                 console.print_line(_command(f"{shlex.quote(name)}{bag.flags}", name.startswith(ROBOTS)))

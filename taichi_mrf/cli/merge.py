@@ -36,7 +36,7 @@ def run_merge(options: Merge) -> int:
 
 
 def _facts(options: Merge, merged: Merged) -> dict[str, Any]:
-    """Where the maps were located, as plain values."""
+    """Locations of the maps, as plain values."""
     places = zip(options.maps[1:], merged.located, strict=True)
     return {
         "map": str(options.out),

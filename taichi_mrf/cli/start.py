@@ -1,5 +1,5 @@
-"""Where the program starts, however it is called: ``taichi-mrf``, ``python -m taichi_mrf``, or a file of
-``apps/`` in a clone, where what the program needs may not be installed."""
+"""Entry point of the program, however it is called: ``taichi-mrf``, ``python -m taichi_mrf``, or a file of
+``apps/`` in a clone, where its dependencies may not be installed."""
 
 import os
 import sys
@@ -24,6 +24,6 @@ def start(*command: str) -> int:
             raise
         clone = Path(__file__).resolve().parents[2]
         package = f"'{clone}'" if (clone / "pyproject.toml").is_file() else "taichi-mrf"
-        problem = f"the package {missing} is not installed: pip install {package} brings all that is needed"
+        problem = f"the package {missing} is not installed: pip install {package} adds all that is needed"
         print(f"taichi-mrf: {problem}", file=sys.stderr)
         return NOT_INSTALLED

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf tune`` prints of its tries, and the files that it leaves."""
+"""Output of ``taichi-mrf tune``: the lines on its trials, and the files that it leaves."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def print_frames(frames: WorkingSet, print_line: PrintLine) -> None:
     """Say which frames are used for what."""
     print_line(
         f"{len(frames.training)} frames of {frames.source} make the map, {len(frames.held_out)} score it"
-        + (f", {len(frames.unseen)} are kept back for the end" if frames.unseen else "")
+        + (f", {len(frames.unseen)} are held back for the end" if frames.unseen else "")
         + f" (from frame {frames.choice.first} on, {frames.choice.stride} apart)"
     )
 

@@ -127,7 +127,7 @@ class DaskTasks:
         )
 
     def _slots_by_host(self, client: Any) -> dict[str, int]:
-        """How many tasks the workers on each host take at a time."""
+        """Number of tasks that the workers on each host take at a time."""
         slots: Counter[str] = Counter()
         for address, threads in client.nthreads().items():
             slots[_host(address)] += threads
@@ -135,7 +135,7 @@ class DaskTasks:
 
 
 class _Share:
-    """How many tasks share a machine: the workers of our own cluster, or the slots of each host."""
+    """Number of tasks that share a machine: the workers of our own cluster, or the slots of each host."""
 
     def __init__(self, workers: int, slots: dict[str, int]) -> None:
         self.workers, self.slots = workers, slots

@@ -9,7 +9,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 ATTEMPTS = 3
-"""How often a task is started, at most, when its processes die."""
+"""Number of starts of a task, at most, when its processes die."""
 
 _LONGEST_NAME = 60
 

@@ -109,7 +109,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """Which frames become keyframes (section V): those taken far enough from the last one."""
+    """Choice of keyframes (section V): frames taken far enough from the last one."""
 
     rotation: float = 0.0
     """A frame rotated by more than this (radians, tangent norm) becomes a keyframe. 0 ignores rotation."""
@@ -132,8 +132,8 @@ class PoseConfig:
     keyframe keeps its pose."""
 
     close_loops: bool = in_files(True)
-    """When poses are tracked: correct the whole trajectory when the camera returns to a place that it has
-    seen (loop closure), and at the end align all keyframes with each other."""
+    """For tracked poses: correct the whole trajectory when the camera returns to a place that it has seen
+    (loop closure), and align all keyframes with each other at the end."""
 
     translation_sigma: float = in_files(0.03)
     """Standard deviation of recorded positions along each axis (metres). It weights recorded poses against
@@ -214,7 +214,7 @@ class VolumeConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How a finished map is checked against frames that it was not built from."""
+    """Check of a finished map against frames that it was not built from."""
 
     hold_out: int = 10
     """Keep every N-th frame out of the map and compare its depth with the map's prediction. 0 maps all frames
@@ -257,7 +257,7 @@ class Config:
     """The sensor's noise and range."""
 
     inference: InferenceConfig = field(default_factory=InferenceConfig)
-    """How the marginals are computed."""
+    """Computation of the marginals."""
 
     log_odds: LogOddsConfig = field(default_factory=LogOddsConfig, metadata=IN_FILES)
     """Occupancy mapping by independent log-odds (method log_odds)."""
@@ -277,19 +277,19 @@ class Config:
     submaps (methods that freeze keyframes: mrf)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
-    """Which frames become keyframes."""
+    """Choice of keyframes."""
 
     poses: PoseConfig = field(default_factory=PoseConfig)
     """Refinement of recorded poses."""
 
     time: TimeConfig = field(default_factory=TimeConfig)
-    """How soon the world may change."""
+    """Rate at which the world may change."""
 
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     """The space and memory of the map."""
 
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    """How a finished map is checked."""
+    """Check of a finished map."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """The device that runs the kernels."""

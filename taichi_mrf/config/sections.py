@@ -16,7 +16,7 @@ LIVE_HALF_LIFE_S = 14400.0
 
 @dataclass(frozen=True)
 class TimeConfig:
-    """How soon the world may change. Each voxel is a two-state Markov chain in time: the older an
+    """Rate at which the world may change. Each voxel is a two-state Markov chain in time: the older an
     observation, the less it counts."""
 
     half_life_s: float = 0.0
@@ -45,7 +45,7 @@ class TimeConfig:
 
     @property
     def flip_rate(self) -> float:
-        """How often a voxel changes its state, per second, if both states are equally likely; 0 if static."""
+        """State changes of a voxel per second, if both states are equally likely; 0 if static."""
         return 0.0 if self.is_static else math.log(2.0) / (2.0 * self.half_life_s)
 
     def forgotten(self, seconds: float) -> float:
@@ -59,7 +59,7 @@ LEAST_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class InferenceConfig:
-    """How the marginals are computed (MRFMap, sections III and IV)."""
+    """Computation of the marginals (MRFMap, sections III and IV)."""
 
     sweeps: int = 3
     """Number of sweeps over all keyframes. Each keyframe uses the newest messages of the others (Gauss-

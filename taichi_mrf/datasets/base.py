@@ -83,19 +83,19 @@ class StatedSensor:
     """Origin of the sigma and the like, in the words of a note."""
 
     reach_m: float | None = None
-    """How far it measures; None if only its depths tell."""
+    """Reach of the sensor; None if only its depths tell."""
 
     pass_through: float | None = None
     """Chance that a ray passes an occupied voxel; None for the default's 0."""
 
     swept_m: float = 0.0
-    """How far it moves, turns counted at 10 m, while it takes an image, where nothing undoes that."""
+    """Uncorrected motion during an image, in metres, rotations counted at 10 m."""
 
 
 @dataclass(frozen=True)
 class Arrivals:
-    """How the frames of a sensor that runs come: ``rate_hz``, and how old that which was read last is by now,
-    ``age_s``, None before the first. ``news`` are sentences for the user on what came about since."""
+    """Arrival of a running sensor's frames: ``rate_hz``, and ``age_s``, the present age of the last frame
+    read, None before the first. ``news`` are sentences for the user on what has happened since."""
 
     rate_hz: float
     age_s: float | None
@@ -157,7 +157,7 @@ class Dataset(ABC):
         return ""
 
     def arrivals(self) -> Arrivals | None:
-        """How the frames of a sensor that runs come, None for any other source."""
+        """Arrival of a running sensor's frames, None for any other source."""
         return None
 
     @property
@@ -178,8 +178,8 @@ class Dataset(ABC):
         return []
 
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
-        """When each frame was taken, in seconds. This reads all of them, unless the source overrides it; a
-        broken frame gets the stamp of the one before it."""
+        """Time of each frame, in seconds. This reads all frames, unless the source overrides it; a broken
+        frame gets the stamp of the one before it."""
         found: list[float] = []
         for index in range(len(self)):
             try:
@@ -198,8 +198,8 @@ class Dataset(ABC):
         return None
 
     def misfit(self) -> str | None:
-        """What is wrong with the first image whose file's header says that it does not fit; None if nothing
-        is, or headers are not looked at."""
+        """Error in the first image whose file header does not fit; None if all fit, or if headers are not
+        checked."""
         return None
 
     def sensor_of(self, index: int) -> str:

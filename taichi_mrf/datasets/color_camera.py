@@ -52,7 +52,7 @@ class ColorCamera:
     def _in_front(
         self, u: NDArray[np.float32], v: NDArray[np.float32], z: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Which points (n,) at pixels (u, v) and depth z have none before them."""
+        """True for points (n,) at pixels (u, v) and depth z that no other point hides."""
         across = self.camera.width // _CELL + 1
         cell = (v.astype(np.int32) // _CELL) * np.int32(across) + u.astype(np.int32) // _CELL
         nearest = np.full(across * (self.camera.height // _CELL + 1), np.float32(np.inf))

@@ -35,12 +35,12 @@ TURNS = {
     "turned-right,mirrored": (3, True),
     "upside-down,mirrored": (2, True),
 }
-"""How images may be stored: by how many quarters to the left, and whether they were mirrored before that."""
+"""Ways to store images: quarter turns to the left, and True if they were mirrored before that."""
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """How poses and depths are to be understood. They are undone in the order of the fields."""
+    """Conventions of poses and depths. They are undone in the order of the fields."""
 
     w_first: bool = False
     """Quaternions are w x y z, and were read as x y z w."""

@@ -109,7 +109,7 @@ def check_metres(depths: Sequence[Image], where: str) -> None:
 
 
 def out_of_sight(dataset: Dataset) -> str:
-    """Why neighbouring frames hardly see the same, if the sensor moves farther between them than it sees."""
+    """Reason why neighbouring frames hardly overlap, if the sensor moves farther than it sees."""
     frames = range(0, len(dataset) - 1, max(1, len(dataset) // _STEPS))
     steps_m, far_m = [], []
     for i in frames:

@@ -256,7 +256,7 @@ def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[in
 def _recorded_pixels(
     camera: PinholeCamera, distortion: Sequence[float], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which recorded pixel saw along the ray of each undistorted pixel, -1 where none did."""
+    """Recorded pixel that saw along the ray of each undistorted pixel, -1 where none did."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     rays = camera.rays()[rows, columns]
     seen, _ = cv2.projectPoints(
@@ -423,7 +423,7 @@ def _shifted(
     track = dataset.own_poses()
     if track is None:
         track = _of_frames(dataset, stamps)
-        notes.append("late: the recording has the poses of frames alone; those between are interpolated")
+        notes.append("late: the recording has only the poses of frames; those between are interpolated")
     timed = TimedPoses(track[0], [pose_of(T, conventions) for T in track[1]])
     usual_s = float(np.median(np.diff(timed.stamps))) if len(timed) > 1 else 0.0
     gap_s = max_time_gap or max(INTERPOLATION_GAP, 2.0 * usual_s)

@@ -38,12 +38,12 @@ _BY_ENDING = {
     **dict.fromkeys((".las", ".laz", ".bin", ".velodyne"), LIDAR_POSES),
     **dict.fromkeys(
         (".xyz", ".pts", ".asc", ".ptx", ".e57"),
-        "is a point cloud in a format that is not read; convert each scan to a .ply or .pcd of its own, and "
+        "is a point cloud in an unsupported format; convert each scan to a .ply or .pcd of its own, and "
         "put a file of the sensor's poses beside them",
     ),
     **dict.fromkeys(
         (".lvx", ".lvx2", ".zbf", ".fls", ".vpcap"),
-        "is a scanner maker's own format, which is not read; convert it to a ROS bag with PointCloud2 and "
+        "is a scanner maker's own format, which is unsupported; convert it to a ROS bag with PointCloud2 and "
         "poses, or each scan to a .ply or .pcd of its own with a file of the sensor's poses beside them",
     ),
     **dict.fromkeys(
@@ -55,24 +55,24 @@ _BY_ENDING = {
     ),
     **dict.fromkeys(
         (".mp4", ".mov", ".avi", ".webm", ".m4v"),
-        "is a film: it has colours, and a map is made of depth; pass the folder of the recording with "
+        "is a video: it has colours, but a map needs depth; pass the folder of the recording with "
         "its depth images",
     ),
     **dict.fromkeys(
         (".mkv", ".svo", ".svo2", ".oni", ".klg", ".rrd"),
-        "is a camera maker's own format, which is not read; record or convert it to a ROS bag with depth, "
+        "is a camera maker's own format, which is unsupported; record or convert it to a ROS bag with depth, "
         "camera_info and poses, or " + AS_NPZ,
     ),
     **dict.fromkeys(
         (".hdf5", ".h5", ".mat", ".npy", ".pkl", ".pt", ".exr", ".pfm", ".raw"),
-        "holds arrays or images in a format that is not read ({name}); " + AS_NPZ,
+        "holds arrays or images in an unsupported format ({name}); " + AS_NPZ,
     ),
     **dict.fromkeys(
         (".fbx", ".dae", ".gltf", ".usd", ".usdz", ".x3d"),
         "contains a mesh ({name}), not depth images; converted to .ply or .glb, 'mesh:FILE?poses=FILE' "
         "renders depth images of it",
     ),
-    ".active": "was not closed by its recorder; 'rosbag reindex' mends it, then call it .bag",
+    ".active": "was not closed by its recorder; 'rosbag reindex' repairs it, then name it .bag",
     ".sens": "is ScanNet's packed format; extract it to depth/, pose/ and intrinsic/ with ScanNet's tools",
 }
 _SAVED_MAP = "is a saved map, not a recording"
@@ -98,7 +98,7 @@ def hint_for(path: Path) -> str | None:
         )
     if is_folder(path / "rtabmap_depth"):
         return (
-            "is what rtabmap-export has written; pass the database itself (rtabmap.db), which has the poses, "
+            "is output of rtabmap-export; pass the database itself (rtabmap.db), which has the poses, "
             "the cameras and where they are mounted"
         )
     if not is_folder(path):
@@ -133,7 +133,7 @@ def image_hint(images: Sequence[Path], what: str) -> str:
             "depth, which colours do not tell; pass the folder that has the depth images too"
         )
     return (
-        f"{what} of depth ({depth.name}) in a layout that is not read: a recording is a folder with all of "
+        f"{what} of depth ({depth.name}) in an unsupported layout: a recording is a folder with all of "
         f"them, their poses and their camera; {AS_NPZ}"
     )
 
@@ -160,13 +160,13 @@ def _kind(path: Path) -> str | None:
 
 def _other_arrays(path: Path) -> str | None:
     try:
-        with open_npz(path, DatasetError, "an npz file that can be read") as file:
+        with open_npz(path, DatasetError, "a readable npz file") as file:
             held = ", ".join(file.names[:8]) or "nothing"
             if {"format", "keyframe_ids"} <= set(file.names):
                 return f"{_SAVED_MAP}: taichi-mrf live, export, info and diff read {path.name}"
     except DatasetError:
         return None
-    return f"contains {held}, and not depth_m, T_world_camera and K of frames, nor xyz of a scan"
+    return f"contains {held}, but not depth_m, T_world_camera and K of frames, nor xyz of a scan"
 
 
 def _is_cloud(path: Path) -> bool:
@@ -177,8 +177,8 @@ def _is_cloud(path: Path) -> bool:
 
 
 def pose_files_hint(folder: Path, images: Sequence[Path], remedy: str = ONE_FILE) -> str | None:
-    """How to read a recording with poses, and perhaps intrinsics, in a text file for each image; None if
-    there are no such files. ``remedy`` says where the reader expects the poses."""
+    """Hint for reading a recording with poses, and perhaps intrinsics, in a text file for each image; None
+    if there are no such files. ``remedy`` says where the reader expects the poses."""
     places = [folder, *(child for child in sorted(folder.iterdir()) if is_folder(child))]
     for place in places:
         texts = [
@@ -194,7 +194,7 @@ def _pose_file_hint(texts: Sequence[Path], remedy: str) -> str | None:
     if texts[0].suffix == ".json":
         return (
             f"{len(texts)} files such as {texts[0].name} may hold the pose and the camera of one image each, "
-            f"in a layout that is not read: {remedy}, and pass --camera fx,fy,cx,cy and --depth-scale (1000 "
+            f"in an unsupported layout: {remedy}, and pass --camera fx,fy,cx,cy and --depth-scale (1000 "
             "for millimetres). Poses of ARKit (Polycam, 3D Scanner App) want --poses-are opengl"
         )
     try:
@@ -212,7 +212,7 @@ def _pose_file_hint(texts: Sequence[Path], remedy: str) -> str | None:
     if camera is None and len(flat) not in (7, 8, 12, 16, 21, 25):
         return None
     return (
-        f"{len(texts)} text files such as {texts[0].name} hold one pose each, in a layout that is not read: "
+        f"{len(texts)} text files such as {texts[0].name} hold one pose each, in an unsupported layout: "
         f"{remedy}, and pass {flags} and --depth-scale (1000 for millimetres)"
     )
 
@@ -232,7 +232,5 @@ def unread_poses(folder: Path) -> str:
             except DatasetError as error:
                 return f". {error}"
             if not is_trajectory(path):
-                return (
-                    f". {path}: seven numbers, of which the last four are no quaternion; angles are not read"
-                )
+                return f". {path}: seven numbers, the last four no quaternion; angles are not read"
     return ""

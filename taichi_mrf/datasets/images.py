@@ -202,8 +202,8 @@ def share_of_largest(steps: NDArray) -> float:
 def note_of_largest(shares: Sequence[float]) -> list[str]:
     """A note, if a good part of the pixels of the frames that were looked at have the largest value."""
     share = float(np.mean(shares)) if len(shares) else 0.0
-    said = f"{share:.0%} of the pixels of {len(shares)} frames looked at have the largest number there is"
-    return [f"depth: {said}, which is no measurement"] if share > _MANY else []
+    said = f"{share:.0%} of the pixels of {len(shares)} frames looked at have the largest possible number"
+    return [f"depth: {said}, which is not a measurement"] if share > _MANY else []
 
 
 def measured(steps: NDArray[Kind]) -> NDArray[Kind]:
@@ -276,11 +276,11 @@ def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
         raise DatasetError(
             f"{where}: not a depth image: expected 16-bit grey, found {_kind(image)}"
             + (
-                "; a picture of depth in colours or 8 bits has lost the measurements, but for a simulator's, "
+                "; a colour or 8-bit picture of depth has lost the measurements, except a simulator's, "
                 "whose colours are bytes of one number (CARLA: 1000 m * (R + 256 G + 65536 B) / (2^24 - 1)): "
                 "compute depth, and write it as 16-bit millimetres"
                 if image.itemsize == 1 and image.ndim == 3
-                else "; a picture of depth in 8 bits has lost the measurements"
+                else "; an 8-bit picture of depth has lost the measurements"
                 if image.itemsize == 1
                 else ""
             )

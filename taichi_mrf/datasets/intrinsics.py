@@ -173,7 +173,7 @@ def _camera_from_names(
 def _camera_from_numbers(numbers: list[float]) -> PinholeCamera:
     width, height, fx, fy, cx, cy = numbers
     if not (width.is_integer() and height.is_integer()):
-        raise ConfigError(f"the image size {width} x {height} is not in whole pixels")
+        raise ConfigError(f"the image size {width} x {height} is not a whole number of pixels")
     return PinholeCamera(round(width), round(height), fx, fy, cx, cy)
 
 

@@ -1,4 +1,4 @@
-"""How a source is read: the options of ``open_dataset``, and those after a question mark in its name."""
+"""Options for reading a source: those of ``open_dataset``, and those after a question mark in its name."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, naming
 from taichi_mrf.sensor.camera import PinholeCamera
 
 DISTORTION_COUNTS = (4, 5, 8)
-"""How many distortion coefficients a lens may have; OpenCV's other models are not for depth cameras."""
+"""Possible numbers of distortion coefficients; OpenCV's other models are not for depth cameras."""
 
 TRACK = "track"
 """In place of a file of poses: find them from the images."""
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a recording is read. Each option replaces what the recording's files or its format give."""
+    """Options for reading a recording. Each overrides the recording's files or its format."""
 
     camera: PinholeCamera | None = None
     """Replaces the recording's or the format's intrinsics."""
@@ -63,7 +63,7 @@ class ReadOptions:
     """``axial``, or ``range`` for the distance along each pixel's ray."""
 
     image_is: str | None = None
-    """How images are turned (conventions.py), such as ``turned-left``."""
+    """Orientation of stored images (conventions.py), such as ``turned-left``."""
 
     body: OwnBody = NO_BODY
     """The robot's own body, whose measurements are left out."""

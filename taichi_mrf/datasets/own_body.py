@@ -1,4 +1,4 @@
-"""What is known of the robot's own body, which its sensor sees: measurements of it are none of the world."""
+"""The robot's own body, as far as it is known: the sensor sees it, but it is no part of the world."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -17,7 +17,7 @@ AnyBody = TypeVar("AnyBody", bound="OwnBody")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnBody:
-    """Where the robot itself is. A pixel on it is neither a measurement of the world nor a missing one."""
+    """Extent of the robot itself. A pixel on it is neither a measurement of the world nor a missing one."""
 
     mask: str | None = field(default=None, metadata=_FILE)
     """A single-channel image (PNG) of the size of the stored depth images: 0 marks the robot's own body, any
@@ -53,8 +53,8 @@ class OwnBody:
         for box in self.body_box:
             if not all(map(math.isfinite, box)) or not all(a < b for a, b in zip(box, box[3:], strict=False)):
                 raise ConfigError(
-                    "--body-box takes X0 Y0 Z0 X1 Y1 Z1 in metres, each of the first three below its fellow "
-                    f"of the last three, not {' '.join(f'{x:g}' for x in box)}"
+                    "--body-box takes X0 Y0 Z0 X1 Y1 Z1 in metres, the first three below the last three, "
+                    f"not {' '.join(f'{x:g}' for x in box)}"
                 )
 
     @property
@@ -63,7 +63,7 @@ class OwnBody:
         return OwnBody(**{each.name: getattr(self, each.name) for each in fields(OwnBody)})
 
     def within(self: AnyBody, folder: Path) -> AnyBody:
-        """The same, with files that are relative to a folder."""
+        """Copy whose files are relative to a folder."""
         mask, robot, joints = (path and str(folder / path) for path in (self.mask, self.robot, self.joints))
         return replace(self, mask=mask, robot=robot, joints=joints)
 

@@ -95,7 +95,7 @@ def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
 def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
     if not (dataset.stated.pixel_sigma and settings.sensor.pixel_sigma):
         return settings
-    dataset.notes.append("sensor.pixel_sigma is false: sensor.sigma holds for all pixels of these frames")
+    dataset.notes.append("sensor.pixel_sigma is false: sensor.sigma applies to all pixels of these frames")
     return replace(settings, sensor=replace(settings.sensor, pixel_sigma=False))
 
 
@@ -113,7 +113,7 @@ def _with_reach(settings: Config, dataset: Dataset, depths_m: NDArray[np.float32
         return _reaching(settings, dataset, useful, f"up to which sigma is at most {USEFUL:.0%} of depth")
     dataset.notes.append(
         f"{beyond:.0%} of the measurements lie beyond sensor.max_depth, {sensor.max_depth:g} m, and show "
-        f"only free space: with --sensor.max-depth {useful:g} those count whose sigma is useful"
+        f"only free space: --sensor.max-depth {useful:g} uses those whose sigma is useful"
     )
     return settings
 

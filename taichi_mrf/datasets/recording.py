@@ -40,7 +40,7 @@ ASKED = "--depth-scale"
 """Origin of a scale that the caller gives."""
 
 LOST = "tracking was lost"
-"""Why a frame without a pose is left out."""
+"""Reason why a frame without a pose is left out."""
 
 _LOOKED_AT = 4
 """Images of which the kind and the share of the largest value are found when a recording is opened."""

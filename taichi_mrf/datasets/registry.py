@@ -61,7 +61,7 @@ def plugs() -> tuple[tuple[Format, ...], tuple[str, ...]]:
 def _guarded(plug: str, found: Any) -> Format:
     """A format of others, whose errors name its plug."""
     if not isinstance(found, Format):
-        raise TypeError(f"it names {found!r}, which is no Format")
+        raise TypeError(f"it names {found!r}, which is not a Format")
 
     def recognises(path: Path) -> bool:
         try:
@@ -226,7 +226,7 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
 
 
 def _not_recognised(path: Path) -> str:
-    """Why a path cannot be opened, and what to do."""
+    """Reason why a path cannot be opened, and the remedy."""
     if is_folder(path):
         children = sorted(path.iterdir())
         inside = [child.name for child in _recordings(children)]
@@ -263,7 +263,7 @@ def _only_inside(path: Path) -> Path | None:
 
 
 def _formats() -> tuple[Format, ...]:
-    """Plugs first: they may read what one of the entries would take."""
+    """Plug-ins first: they may read recordings that an entry would also recognise."""
     return (*plugs()[0], *FORMATS)
 
 

@@ -124,7 +124,7 @@ class RobotModel:
                 solid = MeshScene(mesh) if body.body_space == "free" and geometry.is_watertight else None
                 self._parts[node] = MeshScene(grown(mesh, body.body_margin)), solid
         if not self._parts:
-            raise DatasetError(f"{path}: has no geometry but what is around {self._link}")
+            raise DatasetError(f"{path}: has no geometry except around {self._link}")
         self.note = f"own body: {len(self._parts)} parts of {path}, grown by {body.body_margin:g} m"
         self.note += f"; around the sensor, and left out: {', '.join(around)}" if around else ""
 

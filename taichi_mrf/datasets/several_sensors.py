@@ -70,8 +70,8 @@ class SensorEntry:
     row."""
 
     reading: SourceFlags = field(default_factory=SourceFlags)
-    """How the source is read: fields of the command line's flags, such as depth_scale and mask, whose path is
-    relative to the file."""
+    """Options for reading the source, named as the command line's flags, such as depth_scale and mask, whose
+    path is relative to the file."""
 
     def __post_init__(self) -> None:
         check_field(self.every >= 1, "every", "must be at least 1")

@@ -15,7 +15,7 @@ from taichi_mrf.errors import ConfigError
 
 @dataclass(frozen=True)
 class SourceFlags(OwnBody):
-    """How SOURCE is read; :meth:`keywords` are arguments of ``open_dataset``."""
+    """Options for reading SOURCE; :meth:`keywords` are arguments of ``open_dataset``."""
 
     depth_scale: float | None = None
     """Steps of the depth images per metre, such as 1000 for millimetres, instead of the format's own."""
@@ -44,7 +44,7 @@ class SourceFlags(OwnBody):
     """Depth along the optical axis, or distance along each pixel's ray."""
 
     image_is: str | None = None
-    """How images are stored relative to the sensor's poses, as 'taichi-mrf doctor' finds it: turned-left,
+    """Orientation of the images relative to the sensor's poses, as found by 'taichi-mrf doctor': turned-left,
     turned-right or upside-down, and mirrored (left and right exchanged), separated by a comma."""
 
     def words(self) -> list[str]:

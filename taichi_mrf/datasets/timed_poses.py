@@ -86,7 +86,7 @@ def check_unit(
     faster, slower = ("the poses", f"the {what}") if power > 0 else (f"the {what}", "the poses")
     so, remedy = f"so they seem to be {unit}", f"divide those of the {what} by {times:.0f}"
     if power > 0 and times < max(_SHORTER_UNITS) and min(posed) >= _SINCE_1970_S:
-        so = "so their unit is not the one that was taken"
+        so = "so their unit is not the one assumed"
         remedy = "add the line '# stamp_ns tx ty tz qx qy qz qw' (or stamp_us, stamp_ms) above its numbers"
     elif power > 0:
         remedy = f"add the line '# stamp_{short} tx ty tz qx qy qz qw' just above its numbers"
@@ -98,7 +98,7 @@ def check_unit(
 
 
 def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, gap: float) -> str:
-    """Why nothing has a pose, by the ``stamps`` of both in seconds, and the remedy; empty if not known."""
+    """Reason why nothing has a pose, by the ``stamps`` of both in seconds, and the remedy; or empty."""
     if not len(stamps) or not len(posed):
         return ""
     first, last, begin, end = min(stamps), max(stamps), min(posed), max(posed)

@@ -129,8 +129,8 @@ def numbers_in(text: str, columns: Columns | None) -> list[float]:
 
 
 def stamps_a_second(stamps: Sequence[float]) -> float:
-    """How many a second the stamps of one file count: 1, or a thousand and more where they are too large for
-    seconds since 1970. The earliest tell, as nanoseconds of a clock that starts at 0 become as large."""
+    """Units per second of a file's stamps: 1, or a thousand and more where they are too large for seconds
+    since 1970. The earliest tell, as nanoseconds of a clock that starts at 0 become as large."""
     sizes = np.abs(np.asarray(stamps, np.float64))
     least = np.quantile(sizes[sizes > 0], _EARLIEST) if sizes.any() else 0.0
     return next((rate for first, rate in _MAGNITUDES if least >= first), 1.0)
@@ -314,8 +314,8 @@ def _longest_run(path: Path, poses: tuple[RecordedPose, ...]) -> tuple[RecordedP
     longest = max(runs, key=len)
     begins = ", ".join(f"{run[0].source.removeprefix(f'{path} ')} ({len(run)} poses)" for run in runs)
     warnings.warn(
-        f"{path}: its clock starts again, with runs from {begins}: only the longest is read; a file of "
-        "another run alone is read as that",
+        f"{path}: its clock restarts, with runs from {begins}: only the longest is read; to read "
+        "another, put it in a file of its own",
         stacklevel=2,
     )
     return longest

@@ -58,8 +58,8 @@ def of_image_size(recorded: PinholeCamera, size: tuple[int, int] | None, turned:
 
 
 def turn_hint(camera: PinholeCamera, size: tuple[int, int]) -> str:
-    """What an error adds where images of this (width, height) have the camera's, or a smaller copy's,
-    exchanged; empty for others."""
+    """Hint for an error about images whose (width, height) is the camera's, or a smaller copy's, exchanged;
+    empty for others."""
     is_exchanged = size[0] * camera.width == size[1] * camera.height and size[0] != size[1]
     return "; --image-is turned-left (or turned-right) reads images that were turned" if is_exchanged else ""
 

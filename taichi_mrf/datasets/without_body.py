@@ -24,7 +24,7 @@ from taichi_mrf.sensor.own_evidence import free_up_to_m
 from taichi_mrf.system.files import read_bytes
 
 Body = tuple[NDArray[np.bool_], NDArray[np.float32]]
-"""Which pixels (H, W) of a frame the body covers, and up to which depth nothing else is there; 0: unknown."""
+"""Pixels (H, W) that the body covers, and the depth up to which nothing else is there; 0 if unknown."""
 
 Covered = Callable[[Frame], Body]
 

@@ -1,11 +1,11 @@
-"""How well a map explains a depth image that it has not seen (MRFMap, sections III-D and V).
+"""Accuracy of a map on a depth image that it has not seen (MRFMap, sections III-D and V).
 
-The map is asked, for each pixel, at which depth its ray most likely meets the first surface: where
+For each pixel, the map answers with the depth at which its ray most likely meets the first surface: where
 omega (eq. 18) is largest, or where the ray meets the measured surface near there. The pixel is right if that
-depth is within a tolerance of the depth to judge by. One function for every kind of map.
+depth is within a tolerance of the reference depth. One function serves every kind of map.
 
-The paper and its published code disagree on the tolerance and on rays that meet nothing, so all readings
-are here, and rays without an answer are counted as wrong and reported.
+The paper and its published code disagree on the tolerance and on rays that meet nothing, so all readings are
+implemented, and rays without an answer are counted as wrong and reported.
 """
 
 from dataclasses import dataclass, replace
@@ -35,11 +35,11 @@ NOT_JUDGED, NO_ANSWER, WRONG, RIGHT = 0, 1, 2, 3
 """Values of a pixel of an accuracy image."""
 
 FACE = 0.01
-"""A depth this share of a voxel outside the answer's voxel still counts as in it: surfaces like to lie
+"""A depth this share of a voxel outside the answer's voxel still counts as inside: surfaces often lie
 exactly in the grid's planes, where rounding decides."""
 
 OUTLIERS = 0.01
-"""Share of measurements that the log-likelihood takes for outliers, spread evenly over the sensor's range."""
+"""Share of measurements that the log-likelihood treats as outliers, uniform over the sensor's range."""
 
 MISSED = 0.2
 """Share of measurements that the measured surface does not explain where it is near the likeliest voxel."""
@@ -48,7 +48,7 @@ LEFT = 0.5
 """A ray with more visibility than this at its end has left the map; the paper does not say how much."""
 
 SURFACE_STD = 0.25
-"""Standard deviation of the measured surface in voxels, as its weights have it (docs/surfaces.md)."""
+"""Standard deviation of the measured surface in voxels, according to its weights (docs/surfaces.md)."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class JudgedView:
-    """A view followed through a map once, to be scored in any way.
+    """A view whose rays were cast through a map once, to be scored in any way.
 
-    ``depth_m`` (H, W) is the axial depth to judge by, 0 where nothing is judged; ``measured_m`` (H, W) what a
-    sensor with the noise ``noise`` measured of it, 0 where nothing.
+    ``depth_m`` (H, W) is the reference axial depth, 0 where nothing is judged; ``measured_m`` (H, W) is a
+    sensor's measurement of it with the noise ``noise``, 0 where there is none.
     """
 
     depth_m: NDArray[np.float32]
@@ -183,7 +183,7 @@ class JudgedView:
         if tolerance == "sensor":
             sigma, bias = self.noise.at_pixels(answer)
             return np.abs(self.measured_m - answer - bias) <= 1.5 * sigma
-        raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
+        raise ConfigError(f"there is no tolerance '{tolerance}'; choose from {', '.join(TOLERANCES)}")
 
 
 def log_density(
@@ -212,7 +212,7 @@ def judge_view(
     view: View | None = None,
     by: Answer = "surface",
 ) -> JudgedView:
-    """Follow the rays of a view's pixels through a map.
+    """Cast the rays of a view's pixels through a map.
 
     ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none. Where it is the truth,
     ``measured_m`` (H, W) is what the sensor made of it; else it was measured itself. ``noise`` is that of the
@@ -293,5 +293,5 @@ def accuracy(
     """Score a map on one depth image: :func:`judge_view`, then :meth:`JudgedView.accuracy`. ``by="omega"`` is
     the paper's metric."""
     if tolerance not in TOLERANCES:
-        raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
+        raise ConfigError(f"there is no tolerance '{tolerance}'; choose from {', '.join(TOLERANCES)}")
     return judge_view(m, depth_m, T_world_camera, camera, noise=noise, mask=mask, by=by).accuracy(tolerance)

@@ -34,7 +34,7 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 SIGMAS = 3.0
-"""How far from a measurement, in its sigma, its surface may be."""
+"""Largest distance of a surface from its measurement, in sigmas."""
 
 LEAST_RAYS = 10
 """Rays that must pass or confirm a voxel before it is judged."""
@@ -45,11 +45,11 @@ MAJORITY = 0.75
 
 @dataclass(frozen=True)
 class Sightings:
-    """How many held-out rays pass and confirm each of a map's voxels.
+    """Numbers of held-out rays that pass and confirm each of a map's voxels.
 
-    ``centres`` (N, 3) metres, ``probability`` (N,), and how many rays ``passed`` and ``confirmed`` each,
-    (N,) int32. ``met`` (M,) is for each held-out measurement the highest probability of the voxels near
-    it, -1 where there is none.
+    ``centres`` (N, 3) metres, ``probability`` (N,), and the number of rays that ``passed`` and ``confirmed``
+    each, (N,) int32. ``met`` (M,) is the highest probability of the voxels near each held-out measurement,
+    -1 where there is none.
     """
 
     centres: NDArray[np.float64]

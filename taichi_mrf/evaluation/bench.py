@@ -1,4 +1,4 @@
-"""How fast: what a keyframe costs a live map in its steady state, beside OctoMap on the same frames.
+"""Speed: the cost of a keyframe in a live map in its steady state, beside OctoMap on the same frames.
 
 The first frames fill the map and warm everything up; the last ones are measured. The machine's noise is met
 with medians over keyframes. Both systems get the same points: every pixel that holds a measurement.

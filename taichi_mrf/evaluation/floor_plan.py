@@ -175,7 +175,7 @@ class FloorPlanScores:
     occupied: CellScores
     free: CellScores
     cells: int
-    """How many cells were judged: those that beams touch."""
+    """Number of cells judged: those that beams touch."""
 
 
 def true_cells(plan: FloorPlan, laser_map: LaserMap, path_x_y: NDArray[np.float64]) -> NDArray[np.int8]:

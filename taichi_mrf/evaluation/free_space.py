@@ -138,7 +138,7 @@ def held_share(ends: Counts, visited: Counts) -> Counts:
 
 
 def _bins_allowed(ends: Counts, visited: Counts, most: float) -> int:
-    """How many bins, from the first on, have a share of ends of at most ``most``, which rises with bins."""
+    """Number of bins, from the first on, whose share of ends, which rises, is at most ``most``."""
     allowed = rising_share(ends, visited) <= most
     return len(allowed) if allowed.all() else int(np.argmin(allowed))
 
@@ -253,7 +253,7 @@ def _ended_in(
 
 
 def _rays_in_area(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How many rays pass a square metre at a depth of one, around each pixel, (H, W); 0 where unknown."""
+    """Rays per square metre at a depth of one metre, around each pixel, (H, W); 0 where unknown."""
     if min(rays.shape[:2]) < 2:
         return np.zeros(rays.shape[:2])
     apart = [_lengths(np.gradient(rays, axis=axis)) for axis in (0, 1)]
@@ -273,7 +273,7 @@ def _sees(
     points_m: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.bool_]:
-    """Whether a measured ray passes a voxel or ends in it: centres (n, 3) in the camera's frame -> (n,)."""
+    """True for voxels that a measured ray passes or ends in: centres (n, 3), camera frame -> (n,)."""
     flat, measured_m = rays.reshape(-1, 3), np.asarray(depth_m).reshape(-1)
     if isinstance(camera, RayTable):
         from scipy.spatial import cKDTree  # takes a third of a second to import

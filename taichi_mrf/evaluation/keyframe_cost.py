@@ -62,7 +62,7 @@ class KeyframeCost:
 
 
 def timed(call: Callable[[], object]) -> Seconds:
-    """How long a call takes, until the device has done it."""
+    """Time of a call, until the device has finished it."""
     ti.sync()
     wall, cpu = time.perf_counter(), time.process_time()
     call()

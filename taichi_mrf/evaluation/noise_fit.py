@@ -66,10 +66,10 @@ class SigmaLaw:
 
 @dataclass(frozen=True)
 class Explained:
-    """How well a map explains n measurements. ``sigma_m`` (n,) is the assumed standard deviation of each, in
-    metres, ``stated_m`` (n,) the one without what was learnt, and ``log_likelihood`` (n, OCTAVES) the log
-    density, per metre, under each multiple of ``sigma_m``. ``voxel_m`` is the standard deviation that the
-    size of a voxel adds."""
+    """Fit of a map to n measurements. ``sigma_m`` (n,) is the assumed standard deviation of each, in metres,
+    ``stated_m`` (n,) the one before learning, and ``log_likelihood`` (n, OCTAVES) the log density, per metre,
+    under each multiple of ``sigma_m``. ``voxel_m`` is the standard deviation that the size of a voxel
+    adds."""
 
     sigma_m: NDArray[np.float64]
     stated_m: NDArray[np.float64]
@@ -100,9 +100,8 @@ def explained(
     noise: NoiseModel,
     stated: NoiseModel | None = None,
 ) -> Explained | None:
-    """How well a map explains the measurements of a depth image (H, W) that it has not seen, of which
-    ``noise`` is assumed; ``stated`` is the noise without what was learnt, if that differs. None if there are
-    none to judge."""
+    """Fit of a map to a depth image (H, W) that it has not seen. ``noise`` is the noise assumed for the
+    image; ``stated`` is the noise before learning, if that differs. None without a measurement to judge."""
     table = noise.table(camera)
     pixels = np.flatnonzero((depth_m > 0) & (depth_m <= m.sensor.max_depth))
     if not len(pixels):
@@ -327,7 +326,7 @@ def checked(measured: Explained, frames: int, most: float = DOUBTED) -> NoiseChe
 
 
 def explained_frame(m: VoxelMap, frame: Frame) -> Explained | None:
-    """How well a map explains a frame that it has not seen, by the noise that both state."""
+    """Fit of a map to a frame that it has not seen, by the noise that both state."""
     noise = frame.own_for(m.sensor).noise_model(m.noise, frame.depth_m)
     plain = replace(m.sensor, sigma_scale=1.0, sigma_added=0.0)
     stated = frame.own_for(plain).noise_model(unwidened_noise(m.noise, m.sensor), frame.depth_m)

@@ -1,4 +1,4 @@
-"""How far the probabilities of a map can be trusted, where it is known which voxels are occupied.
+"""Reliability of a map's probabilities, where it is known which voxels are occupied.
 
 Two questions. Do occupied voxels get higher probabilities than free ones (precision and recall, the ROC curve
 and its area)? And is what is given 0.8 occupied in 80% of all cases (Brier score, reliability diagram,
@@ -160,7 +160,7 @@ def reliability_bins(
 def _check(p: NDArray[Any], truth: NDArray[Any], bins: int) -> None:
     if p.ndim != 1 or p.shape != truth.shape:
         raise ConfigError(
-            f"probabilities of shape {p.shape} and truths of shape {truth.shape} do not go together: "
+            f"probabilities of shape {p.shape} and truths of shape {truth.shape} do not match: "
             "both must have the shape (N,)"
         )
     if truth.dtype != np.bool_:
@@ -179,7 +179,7 @@ def _blocks(p: NDArray[np.floating], truth: NDArray[np.bool_]) -> Iterator[tuple
 
 
 def _at_least(ascending: NDArray[np.floating], values: ArrayLike) -> NDArray[np.int64]:
-    """How many of some sorted numbers are no less than each value."""
+    """Number of some sorted numbers that are at least each value."""
     return len(ascending) - np.asarray(np.searchsorted(ascending, values, side="left"), np.int64)
 
 

@@ -58,7 +58,7 @@ class OccupancyTruth:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many voxels are occupied, and how many are free."""
+        """Number of occupied voxels, and number of free ones."""
         return count(self.occupied_marks), count(self.free_marks)
 
     def occupied(self) -> NDArray[np.int32]:
@@ -137,7 +137,7 @@ def seen_voxels(
     camera's size, CapacityError if the space that the images see has too many voxels.
     """
     if len(depths_m) != len(poses):
-        raise FrameError(f"{len(depths_m)} clean depth images do not go with {len(poses)} poses")
+        raise FrameError(f"{len(depths_m)} clean depth images do not match {len(poses)} poses")
     images = [_checked(depth_m, camera) for depth_m in depths_m]
     lower_m, upper_m = _box(images, poses, camera)
     window = Window.covering(lower_m - SLACK * voxel_size, upper_m + SLACK * voxel_size, voxel_size)

@@ -1,4 +1,4 @@
-"""How far measured disparities lie from true ones: where the sigma_d of a stereo matcher comes from.
+"""Error of measured disparities: the source of a stereo matcher's sigma_d.
 
 Gross mismatches are no part of the noise that a map's sensor model describes, so the spread is taken over
 the inliers alone and the share of the others is reported beside it.
@@ -58,7 +58,7 @@ class TruePair:
     right_px: NDArray[np.floating]
 
     def visible(self) -> NDArray[np.bool_]:
-        """Which pixels of the left image the right camera sees as well, (H, W)."""
+        """True for pixels of the left image that the right camera sees as well, (H, W)."""
         return left_right_consistent(self.left_px, self.right_px, tolerance_px=1.0)
 
 

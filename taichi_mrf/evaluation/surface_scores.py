@@ -1,5 +1,5 @@
-"""How well a triangle mesh meets the true surface: F-score, accuracy, completeness, normals, and whether its
-standard deviations are right.
+"""Scores of a triangle mesh against the true surface: F-score, accuracy, completeness, normals, and the
+calibration of its standard deviations.
 
 The truth are the points that clean depth images see, with the planes through them. A distance is that to the
 plane of the nearest point, and as far as the foot lies further aside than the points are apart, to the point.

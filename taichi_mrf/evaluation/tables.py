@@ -56,7 +56,7 @@ class Table:
 
 
 def entry_text(entry: Entry, digits: int, plus_minus: str = "±") -> str:
-    """How an entry is printed; a dash for what does not exist."""
+    """Printed form of an entry; a dash for a missing one."""
     if entry is None:
         return "-"
     if isinstance(entry, Spread):

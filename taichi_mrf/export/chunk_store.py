@@ -261,7 +261,7 @@ def put_chunks(path: Path, header: StoreHeader, put: NDArray[np.int32], layers: 
     store that was not made here, and TaichiMRFError without zarr."""
     new = put.reshape(-1, 3)
     if len(new) and max(-int(new.min()), int(new.max()) + 1) > FARTHEST:
-        raise MapFileError(f"{path}: a chunk further than {FARTHEST} chunks from the origin has no place")
+        raise MapFileError(f"{path}: a chunk further than {FARTHEST} chunks from the origin does not fit")
     grown = exists(path)
     listed = _listed(path) if grown else new[:0]
     known = set(map(tuple, listed.tolist()))

@@ -51,7 +51,7 @@ _DEFAULTS = ExportOptions()
 
 NO_SURFACE = (
     "the images of keyframes that measured the surface are not in the map, or not of all: map the recording "
-    "anew with --keep-surface, or export from the map.npz of a run"
+    "again with --keep-surface, or export from the map.npz of a run"
 )
 """Error for a missing measured surface, and its remedy."""
 
@@ -88,9 +88,9 @@ def _format_of(path: str | Path) -> "ExportFormat":
         return FORMATS[suffix]
     known = ", ".join(FORMATS)
     if not suffix:
-        raise ConfigError(f"{path}: no file extension: cannot choose an export format; known are {known}")
+        raise ConfigError(f"{path}: no file extension: cannot choose an export format ({known})")
     near = difflib.get_close_matches(suffix, FORMATS, 1, cutoff=0.0)[0]
-    raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
+    raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? Choose from {known}")
 
 
 def require_libraries(path: str | Path) -> None:
@@ -218,7 +218,7 @@ def _level(m: VoxelMap, options: ExportOptions, up: Up) -> LevelMap:
 
 @dataclass(frozen=True)
 class MapToSend:
-    """What messages are made from: a map, and ``poses``, those of keyframes by their stamps in seconds."""
+    """Source of messages: a map, and ``poses``, those of its keyframes by stamp in seconds."""
 
     m: VoxelMap
     options: ExportOptions
@@ -231,7 +231,7 @@ class MapToSend:
 
     @property
     def stamp_s(self) -> float:
-        """When the newest keyframe was taken, 0 without one."""
+        """Stamp of the newest keyframe, 0 without one."""
         return max(self.poses, default=0.0)
 
 

@@ -35,7 +35,7 @@ class Points(NamedTuple):
 
 
 class MapSink(Protocol):
-    """What takes the messages of a map: the channels of a file, a server or a robot's wire."""
+    """Receiver of a map's messages: the channels of a file, a server or a robot's wire."""
 
     def transform(self, T_world_camera: Pose, stamp_s: float) -> None:
         """Take the pose (4, 4) of a keyframe as that of the frame CAMERA."""

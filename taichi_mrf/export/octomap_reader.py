@@ -51,7 +51,7 @@ class OctomapLeaves:
 
     @property
     def voxels(self) -> int:
-        """How many voxels the leaves stand for."""
+        """Number of voxels that the leaves stand for."""
         return int((8 ** self.level.astype(np.int64)).sum())
 
     def bricks(self) -> tuple[Bricks, NDArray[np.float32]]:
@@ -115,7 +115,7 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
 
 _KINDS = ", ".join(_NODE_BYTES)
 _Leaves = tuple[int, list[int], list[int], NDArray[np.float32]]
-"""How many nodes there are, with the inner ones; the leaves' codes, levels and log-odds."""
+"""Number of nodes, inner ones included; the leaves' codes, levels and log-odds."""
 
 _BITS = [[child for child in range(7, -1, -1) if mask >> child & 1] for mask in range(256)]
 """The children in a mask, the last one first: they are put on a stack."""

@@ -15,13 +15,13 @@ class ExportOptions:
     """
 
     threshold: float = 0.5
-    """Lowest probability of a voxel that is written as a point or a cube, and the level of a mesh."""
+    """Lowest probability of voxels written as points or cubes, and the level of a mesh."""
 
     cubes: bool = False
-    """Write voxels as cubes: in .ply, and in .glb, .obj, .stl in place of marching cubes."""
+    """Write voxels as cubes: in .ply, and instead of marching cubes in .glb, .obj, .stl."""
 
     mesh: bool = False
-    """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
+    """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, instead of points."""
 
     surface: Literal["auto", "rays", "marginal"] = "auto"
     """Surface of a mesh: rays is the measured surface, finer than voxels; marginal is where the marginal

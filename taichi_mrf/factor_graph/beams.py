@@ -74,7 +74,7 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """How many cells there are."""
+        """Number of cells."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     def to_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -104,7 +104,7 @@ class BrickCells:
 
     @property
     def cells(self) -> int:
-        """How many cells there are."""
+        """Number of cells."""
         return len(self.bricks) * VOXELS
 
     def centres(self) -> NDArray[np.float64]:

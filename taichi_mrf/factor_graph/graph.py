@@ -66,7 +66,7 @@ def _write(state: Template, context: Template, cell: ti.i32):
 
 @ti.kernel
 def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
-    """How many cells each beam crosses, into ``counts`` (beams).
+    """Write the number of cells that each beam crosses to ``counts`` (beams).
 
     ``rays`` is (beams, 7): origin, direction and range in cell sizes from the corner of a grid of ``shape``
     cells.
@@ -79,8 +79,8 @@ def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
 
 @ti.kernel
 def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array):
-    """Which cells each beam crosses, into ``cells`` (edges) from ``begins`` (beams + 1) on; ``rays`` as
-    above."""
+    """Write the cells that each beam crosses to ``cells`` (edges), from ``begins`` (beams + 1) on; ``rays``
+    as above."""
     for beam in range(begins.shape[0] - 1):
         place = _Cursor(begins[beam])
         walk_cells(rays, beam, shape, _write, place, cells)
@@ -88,7 +88,7 @@ def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array
 
 @ti.kernel
 def count_degrees(cells: I32Array, edges: ti.i32, degrees: I32Array):
-    """How many beams cross each cell: ``cells`` (edges) counted into ``degrees`` (cells)."""
+    """Count the beams that cross each cell: ``cells`` (edges) into ``degrees`` (cells)."""
     for edge in range(edges):
         ti.atomic_add(degrees[cells[edge]], 1)
 

@@ -174,13 +174,13 @@ def uniform(bits: ti.u32) -> F32:
 
 @dataclass(frozen=True)
 class _Proposals(Bundle):
-    """How cells are drawn."""
+    """Rule by which cells are drawn."""
 
     warm: I32Array
     """(n): the cells that may be drawn, the heated ones first."""
 
     heated: I32
-    """How many are heated."""
+    """Number of heated cells."""
 
     bias: I32
     """The weight of a heated cell."""
@@ -194,7 +194,7 @@ class _Proposals(Bundle):
     """The number of the first proposal."""
 
     number: I32
-    """How many are made."""
+    """Number of proposals."""
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def sensor_vector(graph: FactorGraph, config: LaserConfig) -> "ti.Vector":
 
 
 def model_kind(graph: FactorGraph, config: LaserConfig) -> int:
-    """Which of the models: the graph's table if it has one, else as configured."""
+    """The sensor model: the graph's table if it has one, else the configured one."""
     if graph.has_table:
         return TABLE
     return GAUSSIAN if config.sensor == "gaussian" else PIECEWISE

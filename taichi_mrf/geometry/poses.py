@@ -74,7 +74,7 @@ def rotation_angle(R: NDArray[np.float64]) -> float:
 
 
 def tangent_norms(T_world_a: Pose, T_world_b: Pose) -> tuple[float, float]:
-    """How far b is from a: (rotation in radians, translation in metres), each a tangent norm."""
+    """Distance of b from a: (rotation in radians, translation in metres), each a tangent norm."""
     T_a_b = inverse(T_world_a) @ T_world_b
     with np.errstate(over="ignore"):  # a damaged pose may lie anywhere: the square of 1e200 is infinity
         return rotation_angle(T_a_b[:3, :3]), float(np.linalg.norm(T_a_b[:3, 3]))

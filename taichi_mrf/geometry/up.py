@@ -1,4 +1,4 @@
-"""Which way is up in a world frame: an axis and a sign, taken from how a camera was held.
+"""The up direction of a world frame: an axis and a sign, from the way a camera was held.
 
 A map keeps the direction of its first keyframe (``up`` in methods/protocol.py).
 """

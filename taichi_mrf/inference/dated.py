@@ -308,7 +308,7 @@ class DatedBelief:
             self._fold(channels, source, places)
 
     def _same(self, source: "Keyframe | Waiting") -> NDArray[np.bool_]:
-        """Which visible bricks are still those that the messages are for, (n,)."""
+        """True for visible bricks that are still those of the messages, (n,)."""
         same: NDArray[np.bool_] = self.pool.identity[source.visible.slots] == source.visible.identity
         return same & source.left if isinstance(source, Waiting) else same
 

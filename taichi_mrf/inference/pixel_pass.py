@@ -1,4 +1,4 @@
-"""What pixels give to voxels: by the posterior that they saw them.
+"""Contributions of pixels to voxels, weighted by the posterior that they saw them.
 
 A pixel gives to every voxel i on its ray by the probability that the voxel is the surface that made the
 measurement, given all that the other keyframes know (nu, m, vis as in sum_product.py, o for outliers):
@@ -85,7 +85,7 @@ class PixelVisitor(RayVisitor, ABC):
 
     @ti.func
     def read(self, block: I32):
-        """What the pixels of a ray say (``block`` is for ray_list.block_of), for :meth:`give`."""
+        """The evidence of a ray's pixels (``block`` is for ray_list.block_of), for :meth:`give`."""
 
     @ti.func
     def give(self, voxel: I32, unit: F32, said: Template):
@@ -188,7 +188,7 @@ class PixelPass:
             self._clean = True
 
     def share(self, keyframe: Keyframe, pool: BrickPool) -> VoxelShare:
-        """What a keyframe would add."""
+        """The sums that a keyframe would add."""
         visible = keyframe.visible
         n = len(visible.slots) * VOXELS if self._spread(keyframe, pool) else 0
         found = self._sums.to_numpy()[: n * self._words].reshape(n, self._words)

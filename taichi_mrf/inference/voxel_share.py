@@ -1,6 +1,6 @@
-"""What keyframes leave in voxels: sums as integers, the same in whatever order they are added.
+"""Shares of keyframes in voxels: integer sums, which do not depend on the order of addition.
 
-Each voxel has some ``words``, int64 with a number in each half. What a keyframe gives to a layer
+Each voxel has some ``words``, int64 with a number in each half. A keyframe's contribution to a layer
 (pixel_pass.py) is rounded to integers, so its share can be kept when its images are dropped.
 """
 

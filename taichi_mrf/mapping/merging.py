@@ -1,4 +1,4 @@
-"""Several maps of one place as one map: each located in the others, then one pose graph over all overlaps.
+"""Merges several maps of one place: each is located in the others, then one pose graph covers all overlaps.
 
 The first map stays where it is. A map that is not found in it may be found in another that was. Keyframes of
 two maps that see the same are aligned with each other, as where a loop is closed (loops.py), and the graph of
@@ -151,7 +151,7 @@ def _located(parts: Sequence[MRFMap], names: Sequence[str]) -> list[LocatedRecor
 
 
 def _found(m: MRFMap, other: MRFMap) -> LocatedRecording:
-    """Where a map lies in another: by its keyframes, or, if any are frozen, by its voxels."""
+    """Location of a map in another: by its keyframes, or by its voxels if any keyframe is frozen."""
     if not m.frozen:
         return locate(other, [frame_of(keyframe) for keyframe in m.keyframes.values()])
     scans = list(scans_of(m, whole_map(m)))

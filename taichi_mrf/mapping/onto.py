@@ -1,7 +1,7 @@
-"""A recording of today in the map of yesterday: found in it, and read in the map's world.
+"""Today's recording in yesterday's map: located in it, and transformed into the map's world.
 
-A few stretches of the recording are searched for in what the map's keyframes have measured, by
-alignment/locate_recording.py. Once one is found, all frames are read where they belong, and are mapped as if
+A few stretches of the recording are located in the surface that the map's keyframes have measured, by
+alignment/locate_recording.py. Once one is found, all frames are read in the map's world, and are mapped as if
 they had been taken in the same run.
 """
 
@@ -57,7 +57,7 @@ def parameters_onto(of_map: Config, asked: Config, default: Config, where: str) 
     refused = [name for name in wanted if name in others and not name.startswith(MAY_DIFFER)]
     if refused:
         raise ConfigError(
-            f"{where}: was made with another {', '.join(refused)}, which holds for all that is added to it"
+            f"{where}: was made with another {', '.join(refused)}, which applies to all that is added to it"
         )
     parameters = replace(of_map, runtime=asked.runtime, fit_voxel_size=False)
     for name in wanted:
@@ -115,11 +115,11 @@ def whole_map(m: OccupancyMap) -> WholeMap:
     align keyframes."""
     if not can_refine_poses(m):
         raise ConfigError(
-            f"a recording is found in maps of the method {methods_with('can_refine_poses')}, "
+            f"a recording can be located in maps of the method {methods_with('can_refine_poses')}, "
             f"not {m.METHOD.name}"
         )
     if m.up is None:
-        raise ConfigError("nothing can be found in a map without keyframes that does not say which way is up")
+        raise ConfigError("nothing can be located in a map with neither keyframes nor a known up direction")
     if m.frozen:
         return map_of_voxels(m)
     m.aligner.surface.update(m.keyframes)
@@ -247,7 +247,7 @@ def _tracked_live(
             for every_other in list(kept)[1::2]:
                 del kept[every_other]
         if len(part) == RULES.whole_frames:
-            tell("hold the camera still: what it has seen is looked for in the map")
+            tell("hold the camera still: its views are being located in the map")
             yield part
             searched += 1
             if searched == RULES.whole_stretches:
@@ -255,7 +255,7 @@ def _tracked_live(
             tell("not found there: show the camera another part of the place")
             intake = None
         elif isinstance(answer, Lost) and answer.in_a_row > RULES.long_lost:
-            tell("the camera is lost, as it was moved too fast or sees too little: it begins again")
+            tell("the camera is lost, as it moved too fast or sees too little: it begins again")
             intake = None
 
 
@@ -348,7 +348,7 @@ class Placed(Derived):
         self._next = 0
 
     def awaiting(self) -> str:
-        """What the source waits for, once the frames that were kept are read."""
+        """The source's answer, once the kept frames have been read."""
         return "" if self._next < len(self._first) else self.source.awaiting()
 
     @property

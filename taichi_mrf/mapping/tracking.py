@@ -182,7 +182,7 @@ class Tracker:
             return f"it would look through {100 * through:.1f}% of the mapped surface"
         if overlap < least:
             near, needed = 100 * overlap, 100 * least
-            return f"{near:.0f}% of its points lie near mapped surfaces, {needed:.0f}% are needed"
+            return f"{near:.0f}% of its points lie near mapped surfaces, but {needed:.0f}% are needed"
         return ""
 
     def _unconfirmed(self, T_world_camera: Pose, overlap: float) -> str:
@@ -197,7 +197,7 @@ class Tracker:
         near = self._again and _within_reach(self._again[-1], T_world_camera)
         self._again = [*self._again, T_world_camera] if near else [T_world_camera]
         missing = RULES.relocated - len(self._again)
-        return f"it fits a place that the frames after it have to confirm, {missing} more" if missing else ""
+        return f"it fits a place that {missing} more frames must confirm" if missing else ""
 
     def took(self, keyframe: int) -> TrackedFrame:
         """Note that the frame that was followed last has become this keyframe of the map, and may have been

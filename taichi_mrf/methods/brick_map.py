@@ -86,9 +86,9 @@ def check_inference(
 
 
 class BrickMap(PixelReader, Owned):
-    """An empty map of bricks that answers queries; a method's map subclasses it and says how to fill it.
+    """An empty map of bricks that answers queries; each method subclasses it and fills it in its own way.
 
-    ``config`` is the whole configuration that the map was made with, ``view`` follows rays through the map.
+    ``config`` is the whole configuration of the map; ``view`` casts rays through it.
     """
 
     METHOD: ClassVar[Method]
@@ -97,11 +97,11 @@ class BrickMap(PixelReader, Owned):
     view: View = owned_attribute()
 
     promise: "free.FreePromise | None" = None
-    """What levels of free space mean in this map, from frames that it has not seen
-    (evaluation.free_space.calibrate_free); ``taichi-mrf map`` finds it. None: by the default table."""
+    """Bounds for the levels of free space in this map, from frames that it has not seen
+    (evaluation.free_space.calibrate_free); ``taichi-mrf map`` sets them. None: the default table."""
 
     window: Any = None
-    """What keeps only a part of an MRFMap in memory (moving_window.MovingWindow), None if all of it stays."""
+    """Keeps only a part of an MRFMap in memory (moving_window.MovingWindow); None if all of it stays."""
 
     _next_id: int
     """The id of the next keyframe: how many were added."""
@@ -138,14 +138,14 @@ class BrickMap(PixelReader, Owned):
 
     @classmethod
     def from_config(cls: type[MapT], config: Config, camera: Camera) -> MapT:
-        """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
+        """A map with a configuration's parameters, whose noise tables must fit ``camera``."""
         instance(config, Config, "config", "a Config")
         check_camera(camera)
         return cls.with_noise(config, noise_from_config(config.sensor, camera))
 
     @classmethod
     def with_noise(cls: type[MapT], config: Config, noise: NoiseModel) -> MapT:
-        """A map with a configuration's parameters but for its noise, which is given."""
+        """A map with a configuration's parameters, except for its noise, which is given."""
         m = cls.__new__(cls)
         m._set_up(config, noise)
         return m
@@ -169,10 +169,10 @@ class BrickMap(PixelReader, Owned):
             ``color`` on, unchecked. If it raises, the map is as before."""
 
     def add(self, frame: Frame) -> int:
-        """Add a frame, such as :func:`open_dataset` reads, as a keyframe; returns its id. The configuration
-        decides which of the frame's noise and missing returns are used, the method if its images are. The
-        first frame sets the map's origin in the recorded world. Raises the errors of ``add_keyframe``, and
-        ConfigError for a frame of another origin."""
+        """Add a frame, as read by :func:`open_dataset`, as a keyframe; returns its id. The configuration
+        decides whether the frame's noise and missing returns are used, and the method whether its images are.
+        The first frame sets the map's origin in the recorded world. Raises the errors of ``add_keyframe``,
+        and ConfigError for a frame with another origin."""
         config = _at_origin_of(frame, self.config, is_empty=self.up is None)
         color, images = (frame.color, frame.images) if self.METHOD.has_colors else (None, {})
         own = dataclasses.replace(frame.own_in(config), images=images)
@@ -258,13 +258,12 @@ class BrickMap(PixelReader, Owned):
     def render_depth(
         self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "surface"
     ) -> NDArray[np.float32]:
-        """Axial depth of the surface that each pixel most likely sees, (H, W) float32, NaN where there is
-        none.
+        """Axial depth of each pixel's most likely surface, (H, W) float32, NaN where there is none.
 
-        A ray ends on the surface that keyframes measured where that is near its likeliest voxel
-        (queries.measured_depth). Elsewhere, and in maps without such a surface, it ends in the middle of that
+        A ray ends on the surface that keyframes measured if that lies near the ray's likeliest voxel
+        (queries.measured_depth). Elsewhere, and in maps without such a surface, it ends at the centre of that
         voxel, if it is more likely to be stopped than to pass.
-        ``by="omega"`` leaves the surface out: the paper's answer (eq. 18)."""
+        ``by="omega"`` ignores the measured surface, as in the paper (eq. 18)."""
         check_camera(camera)
         T = as_pose(T_world_camera)
         likeliest_m, stopped = self.view.likeliest_depth(camera, T, self.sensor.max_depth)
@@ -286,12 +285,12 @@ class BrickMap(PixelReader, Owned):
         return measured.near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
 
     def _measured_surface(self) -> "MeasuredDepth | None":
-        """The surface that keyframes measured, as rays meet it; None in maps without one."""
+        """The surface that keyframes measured, for ray casts; None in maps without one."""
         return None
 
     @property
     def has_surface(self) -> bool:
-        """True if the map holds the surface of all keyframes that it was made of."""
+        """True if the map holds the surface measured by all its keyframes."""
         return False
 
     def surface(self) -> Any:
@@ -323,8 +322,8 @@ class BrickMap(PixelReader, Owned):
         camera: Camera,
         own: OwnEvidence = NOTHING,
     ) -> NDArray[np.float32]:
-        """How much each pixel of a depth image that is not in the map contradicts it, (H, W) float32 in nats:
-        above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
+        """Contradiction between the map and each pixel of a depth image that is not in it, (H, W) float32 in
+        nats: above 0 something new, below 0 a vanished surface (queries.contradiction.ray_scores)."""
         return contradiction.ray_scores(self, depth_m, T_world_camera, camera, own)
 
     @tensors.in_kind("points")
@@ -335,30 +334,30 @@ class BrickMap(PixelReader, Owned):
 
     @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
-        """The probability that a ball of ``radius_m`` metres hits something on its way from point to point: a
-        path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as
-        :meth:`occupied_within`, and ConfigError for a path without points."""
+        """The probability that a ball of ``radius_m`` metres collides on its way from point to point: a path
+        (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as :meth:`occupied_within`,
+        and ConfigError for a path without points."""
         return within.path_collision(points, radius_m, *self._likely_grid())
 
     @tensors.in_kind("points")
     def free_with(self, points: ArrayLike, level: float = 0.99, radius_m: float = 0.0) -> NDArray[np.bool_]:
-        """Whether points (N, 3) in metres, or balls of ``radius_m`` around them, are free at a level: of the
-        voxels that are, at most 1 - ``level`` contain matter. (N,) bool. A ball is free if all voxels that it
-        reaches into are (queries.free).
+        """True for points (N, 3) in metres, or balls of ``radius_m`` around them, that are free at a level:
+        at most 1 - ``level`` of such voxels contain matter. (N,) bool. A ball is free if all voxels that it
+        overlaps are free (queries.free).
 
         The level's bound is that of :attr:`promise`. Raises ConfigError for a level that cannot be promised,
-        and in a map that is not :attr:`settled`: its probabilities are not those that were calibrated."""
+        and in a map that is not :attr:`settled`: its probabilities are not the calibrated ones."""
         return free.free_with(self, points, level, radius_m)
 
     @tensors.in_kind("points")
     def path_free_with(self, points: ArrayLike, radius_m: float, level: float = 0.99) -> NDArray[np.bool_]:
-        """Whether all voxels that a ball reaches into on a path (N, 3) -> (), or paths (P, N, 3) -> (P,), are
-        free at a level; the rest as :meth:`free_with`."""
+        """True if all voxels that a ball overlaps along a path (N, 3) -> (), or paths (P, N, 3) -> (P,), are
+        free at a level; otherwise as :meth:`free_with`."""
         return free.path_free_with(self, points, radius_m, level)
 
     def box_free_with(self, lower: ArrayLike, upper: ArrayLike, level: float = 0.99) -> bool:
-        """Whether all voxels of an upright box between two corners, (3,) in metres, are free at a level; the
-        rest as :meth:`free_with`."""
+        """True if all voxels of an upright box between two corners, (3,) in metres, are free at a level;
+        otherwise as :meth:`free_with`."""
         return free.box_free_with(self, lower, upper, level)
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""A finished map that is read from disk by chunks of 64^3 voxels and never held in memory as a whole."""
+"""A finished map, read from disk in chunks of 64^3 voxels and never held in memory as a whole."""
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -71,14 +71,13 @@ def _voxels_of(points: ArrayLike, voxel_size: float) -> NDArray[np.int64]:
 
 
 LogOdds = Literal["stored", "marginal", "decided", "calibrated"]
-"""Kind of a chunked map's log-odds: as they are stored, the marginals', which questions are answered by what
-is occupied from; the marginals' alone; those of what is occupied; or those that can be trusted as
-probabilities."""
+"""Kind of a chunked map's log-odds: the stored marginals', from which queries derive the decided states; the
+marginals' alone; the decided ones; or the calibrated ones."""
 
 
 class ChunkedMap(PixelReader):
-    """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
-    MB (10^6 bytes); beyond that, memory grows only with the answers."""
+    """Answers queries from a :class:`ChunkStore` on disk. It caches the most recently used chunks, up to
+    ``cache_mb`` MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
     def __init__(self, store: ChunkStore, cache_mb: float = 256.0, by: LogOdds = "stored") -> None:
         """Raises ConfigError for a cache smaller than one chunk."""
@@ -107,7 +106,7 @@ class ChunkedMap(PixelReader):
 
     @cached_property
     def decided(self) -> "ChunkedMap":
-        """The map by what is occupied, as MRFMap.decided; itself if the store holds no votes of rays."""
+        """The map with decided states, as MRFMap.decided; itself if the store holds no votes of rays."""
         if self._by != "stored" or FIRST not in self.store.layers:
             return self
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "decided")
@@ -124,7 +123,7 @@ class ChunkedMap(PixelReader):
         hold the measurements of rays."""
         if not self.has_surface:
             raise ConfigError(
-                f"{self.store.path}: holds no measurements of rays: map the recording anew with "
+                f"{self.store.path}: holds no measurements of rays: map the recording again with "
                 "--keep-surface, or export from the map.npz of a run"
             )
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "calibrated")
@@ -159,7 +158,7 @@ class ChunkedMap(PixelReader):
 
     @tensors.in_kind("points")
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Log-odds of occupied at (N, 3) points in metres, (N,), by what is :attr:`decided`; the prior where
+        """Log-odds of occupied at (N, 3) points in metres, (N,), as in :attr:`decided`; the prior where
         nothing was observed.
 
         Raises ConfigError for points of another shape or that are not finite.
@@ -185,8 +184,8 @@ class ChunkedMap(PixelReader):
         return self._state(self.log_odds(points))
 
     def box(self, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
-        """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays, by what
-        is :attr:`decided`.
+        """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays, as in
+        :attr:`decided`.
 
         Raises ConfigError for corners that make no box, CapacityError if there is not enough memory.
         """
@@ -209,8 +208,8 @@ class ChunkedMap(PixelReader):
         upper: ArrayLike | None = None,
         min_probability: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Observed voxels of at least this probability, by what is :attr:`decided`, in a box (default: the
-        whole map): centres (N, 3) in metres, and probabilities (N,).
+        """Observed voxels of at least this probability, as in :attr:`decided`, in a box (default: the whole
+        map): centres (N, 3) in metres, and probabilities (N,).
 
         Raises ConfigError for a probability outside [0, 1] and for corners that make no box.
         """

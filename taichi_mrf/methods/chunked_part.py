@@ -1,4 +1,4 @@
-"""A box of a chunked map, loaded into memory for all queries and exports; all of it, to be gone on with."""
+"""A box of a chunked map, loaded into memory for queries and exports; or the whole map, to continue it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -88,7 +88,7 @@ class MapPart(PixelReader):
     def render_depth(
         self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "omega"
     ) -> NDArray[np.float32]:
-        """Axial depth (H, W) of the middle of the voxel that each pixel most likely sees; NaN for none."""
+        """Axial depth (H, W) of the centre of each pixel's most likely voxel; NaN for none."""
         check_camera(camera)
         return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
 
@@ -108,7 +108,7 @@ class MapPart(PixelReader):
 
     @cached_property
     def decided(self) -> "MapPart":
-        """The part by what is occupied, as MRFMap.decided."""
+        """The part with decided states, as MRFMap.decided."""
         by_votes, brick_m = self.source.decided, BRICK * self.voxel_size
         if by_votes is self.source:
             return self
@@ -124,7 +124,7 @@ class MapPart(PixelReader):
 
     @cached_property
     def _likely(self) -> "MapPart":
-        """The part by which voxels have their states where the map holds what rays measured, else itself."""
+        """The part that decides the states of voxels if the map holds the rays' measurements, else itself."""
         return self.decided if self.source.holds_marginals and self.has_surface else self
 
     @tensors.in_kind("points")
@@ -155,7 +155,7 @@ class MapPart(PixelReader):
         in the box, so that the surfaces of adjoining parts meet. Raises ConfigError if the map holds none."""
         if not self.has_surface:
             raise ConfigError(
-                f"{self.source.store.path}: holds no measured surface: map the recording anew with "
+                f"{self.source.store.path}: holds no measured surface: map the recording again with "
                 "--keep-surface, or export from the map.npz of a run"
             )
         first, after = self.lowest * BRICK, self.after * BRICK
@@ -218,8 +218,8 @@ def render_chunked(m: ChunkedMap, camera: Camera, T_world_camera: ArrayLike) -> 
 
 
 def in_chunks(m: OccupancyMap) -> ChunkedMap | None:
-    """The map in chunks that holds the parts of a map that are outside of its window, as of when they left
-    memory, and the others as of the last save. None for a map that is in memory as a whole."""
+    """The chunked map that holds the parts of a map outside its window, as they were when they left memory,
+    and the others as of the last save. None for a map that is in memory as a whole."""
     window = window_of(m)
     if window is None or window.folder is None or not len(window.parked):
         return None
@@ -227,9 +227,9 @@ def in_chunks(m: OccupancyMap) -> ChunkedMap | None:
 
 
 def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:
-    """Load the bricks that overlap a box, given by two corners, (3,) in metres each; None means the map's own
-    corner. Raises ConfigError for corners that make no box or for an empty map, CapacityError if there is not
-    enough memory."""
+    """Load the bricks that overlap a box, given by two corners, (3,) in metres each; None stands for the
+    map's corner. Raises ConfigError for corners that make no box or for an empty map, CapacityError if there
+    is not enough memory."""
     runtime.init()
     low, high = m.extent
     corners = low if lower is None else lower, high if upper is None else upper
@@ -260,7 +260,7 @@ def config_in_memory(m: ChunkedMap) -> Config:
     """The parameters of :func:`in_memory`. Raises MapFileError as it does."""
     config, path = m.config, m.store.path
     if not METHODS[config.method].can_freeze:
-        raise MapFileError(f"{path}: maps of the method {methods_with('can_freeze')} are gone on with")
+        raise MapFileError(f"{path}: only maps of the method {methods_with('can_freeze')} can be continued")
     if config.time.half_life_s > 0:
         raise MapFileError(f"{path}: its world may change, and chunks hold no dates: pass a map.npz")
     return replace(config, keep_surface=False, volume=replace(config.volume, window_m=0.0))

@@ -265,13 +265,13 @@ _PROMISE = ("levels", "bound", "held_least", "held_most", "lost_m")
 
 
 def promise_arrays(promise: "FreePromise") -> dict[str, NDArray[Any]]:
-    """What levels of free space mean, as arrays by name."""
+    """The bounds for the levels of free space, as arrays by name."""
     arrays = {f"promise_{name}": getattr(promise, name) for name in _PROMISE}
     return {**arrays, "promise_blocks": np.asarray(promise.blocks)}
 
 
 def read_promise(file: NpzFile) -> "FreePromise | None":
-    """What :func:`promise_arrays` has saved; None in files without it, as earlier versions wrote them."""
+    """The bounds that :func:`promise_arrays` saved; None in files of earlier versions, which have none."""
     if "promise_levels" not in file:
         return None
     levels = file.array("promise_levels", "f", (None,))

@@ -93,11 +93,11 @@ class OccupancyMap(VoxelMap, Protocol):
 
     @property
     def stale(self) -> bool:
-        """True if the last removals and moves show only after :meth:`infer`."""
+        """True if recent removals and moves take effect only with the next :meth:`infer`."""
         ...
 
     promise: "FreePromise | None"
-    """What levels of free space mean, from frames that the map has not seen (queries.free)."""
+    """Bounds for the levels of free space, from frames that the map has not seen (queries.free)."""
 
     @property
     def settled(self) -> bool:
@@ -172,7 +172,7 @@ class OccupancyMap(VoxelMap, Protocol):
         ...
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes observe each voxel of some bricks of ``view.pool``, (n,) slots -> (n, 512).
+        """Number of keyframes that observe each voxel of bricks of ``view.pool``, (n,) slots -> (n, 512).
         Zeros if the method does not store it."""
         ...
 

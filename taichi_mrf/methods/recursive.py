@@ -82,13 +82,13 @@ class Scan(Generic[FootprintT]):
 
 
 class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
-    """A probabilistic occupancy map that integrates one depth image after the other.
+    """A probabilistic occupancy map that integrates depth images one by one.
 
-    A voxel is unknown until the first scan observes it, and from then on free or occupied by the sign of its
+    A voxel is unknown until a scan observes it, and from then on free or occupied by the sign of its
     log-odds. Removing or moving a keyframe makes the map stale: queries still return the old values, and the
     next :meth:`infer` integrates all remaining scans again.
 
-    ``view`` follows rays through the map and treats voxels that are unknown or more likely free than occupied
+    ``view`` casts rays through the map and treats voxels that are unknown or more likely free than occupied
     as empty. The lowest probability of such a map, 0.12, read as an occlusion density (eq. 15 of MRFMap),
     would stop every ray within a metre or two.
     """
@@ -129,8 +129,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def stale(self) -> bool:
-        """True if keyframes were removed or moved, or with a half-life came late, since the voxels were last
-        computed."""
+        """True if, since the voxels were last computed, keyframes were removed or moved, or (with a
+        half-life) arrived late."""
         return self._stale
 
     @property
@@ -146,7 +146,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     def _place_keyframe(
         self, name: str, T_world_camera: Pose, stamp_s: float, depth_m: ArrayLike, camera: Camera, **own: Any
     ) -> None:
-        """With a half-life a scan that is older than another one makes the map stale."""
+        """With a half-life, a scan older than one already added makes the map stale."""
         if own.pop("color") is not None or own.pop("images"):
             raise ConfigError(
                 f"a map of the method {self.METHOD.name} has no colours: pass no color or images"
@@ -161,7 +161,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         elif missing is not None and self.sensor.no_return != "ignore":
             warnings.warn(
                 f"sensor.no_return: {self.sensor.no_return} has no effect: a map of the method "
-                f"{self.METHOD.name} takes no notice of {int(missing.sum())} pixels without a return. "
+                f"{self.METHOD.name} ignores {int(missing.sum())} pixels without a return. "
                 "Set it to ignore, or map with mrf (free, model) or log_odds (free)",
                 stacklevel=3,
             )
@@ -202,10 +202,10 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     ) -> InferReport:
         """Rebuild the map if it is stale; otherwise do nothing.
 
-        All scans are integrated again in the order in which they were added, with a half-life in that of
+        All scans are integrated again in the order in which they were added or, with a half-life, in order of
         their stamps. The result is the map of these scans alone. ``sweeps``, ``tolerance`` and ``keyframes``
         are arguments of MRFMap.infer; here they are checked and ignored. ``progress`` is called after each
-        scan; if it returns False, the map holds the scans up to there and stays stale. Raises CapacityError
+        scan; if it returns False, the map holds the scans so far and stays stale. Raises CapacityError
         if there is not enough memory.
         """
         return driven(self.infer_steps(sweeps, tolerance, keyframes), progress)
@@ -258,7 +258,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         )
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Zeros, (n,) -> (n, 512): a recursive map does not store how many keyframes observe a voxel."""
+        """Zeros, (n,) -> (n, 512): a recursive map does not count the keyframes that observe a voxel."""
         return np.zeros((len(slots), VOXELS), np.uint8)
 
     def save(self, path: str | Path) -> None:

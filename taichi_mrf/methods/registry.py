@@ -1,4 +1,4 @@
-"""A map of the method that the configuration names, or that a saved map's file names."""
+"""Creates a map of the method that a configuration or a saved map's file names."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ from taichi_mrf.system.files import is_folder
 
 
 def create_map(config: Config, camera: Camera) -> OccupancyMap:
-    """An empty map of the method ``config.method``; ``camera`` is what its noise tables must fit."""
+    """An empty map of the method ``config.method``, whose noise tables must fit ``camera``."""
     m: OccupancyMap = METHODS[config.method].load_class().from_config(config, camera)
     return m
 
 
 def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
-    """A saved map of any method; ``memory_limit_gb`` overrides its memory limit. Raises MapFileError, or
-    CapacityError if there is not enough memory for it. A map in chunks (.zarr) loads as frozen."""
+    """Load a saved map of any method; ``memory_limit_gb`` overrides its memory limit. Raises MapFileError, or
+    CapacityError if there is not enough memory. A map in chunks (.zarr) is loaded as frozen."""
     if is_folder(Path(path)) and Path(path).suffix == SUFFIX:
         return chunked_part.in_memory(chunked.ChunkedMap.open(path), memory_limit_gb)
     with open_map_file(Path(path)) as file:

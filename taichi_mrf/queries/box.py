@@ -1,5 +1,5 @@
-"""Boxes of space as arrays, with the probability and the state of every voxel, how far a map reaches, and
-cuts through it as images.
+"""Boxes of space as arrays, with the probability and the state of every voxel, the extent of a map, and
+slices of it as images.
 """
 
 from dataclasses import dataclass
@@ -63,17 +63,17 @@ class BoxOfVoxels:
 
 
 def read_box(m: VoxelMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
-    """The voxels that a box reaches into, from corner ``lower`` to corner ``upper``, (3,) in metres, by what
-    is ``decided`` in the map.
+    """The voxels that overlap a box, from corner ``lower`` to corner ``upper``, (3,) in metres, as in the
+    map's ``decided``.
 
-    Raises ConfigError for corners that make no box, CapacityError if it holds more voxels than fit memory.
+    Raises ConfigError for corners that make no box, CapacityError if its voxels do not fit into memory.
     """
     return voxel_box(m.decided, *voxels_of_box(lower, upper, m.voxel_size))
 
 
 def map_extent(m: VoxelMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two corners, (3,) in metres, of the box around all that is known in the map; it ends at bricks of
-    8 voxels. Raises ConfigError for an empty map."""
+    """Two corners, (3,) in metres, of the box around all known space, rounded out to bricks of 8 voxels.
+    Raises ConfigError for an empty map."""
     bricks = known_bricks(m)
     if not len(bricks):
         raise ConfigError("the map is empty: nothing was ever seen")

@@ -19,7 +19,7 @@ from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 Unknown = Literal["free", "stop", "hit"]
-"""Policy of a ray that comes to unknown space: pass, end there without a hit, or count it as a hit."""
+"""Policy for a ray that reaches unknown space: pass, end there without a hit, or count it as a hit."""
 
 _POLICIES: dict[str, int] = {"free": 0, "stop": 1, "hit": 2}
 _PASSED, _HIT, _STOPPED = 0, 1, 2
@@ -32,9 +32,9 @@ the time that four rays save."""
 
 @dataclass(frozen=True)
 class RayHits:
-    """Ends of rays: ``hit`` (N,) is True where a ray met something, ``range`` (N,) float32 its length in
+    """Ends of rays: ``hit`` (N,) is True where a ray hit something, ``range`` (N,) float32 is its length in
     metres, ``point`` (N, 3) float64 its end in the world; ``in_unknown`` (N,) is True where unknown space
-    ended it. A ray without an end has the largest range."""
+    stopped it. A ray that nothing stops has the maximum range."""
 
     hit: NDArray[np.bool_]
     range: NDArray[np.float32]

@@ -69,8 +69,8 @@ def compare_maps(a: VoxelMap, b: VoxelMap, bricks: Bricks | None = None) -> MapC
     """Compare two maps over all space known in either, including free space without voxels; or only in
     ``bricks``, (n, 3) coordinates.
 
-    States and probabilities are by what is ``decided`` in each; ``m.marginals`` compares marginals. The maps
-    can be of different methods. Raises ConfigError if their voxels are of different sizes.
+    States and probabilities are those of each map's ``decided``; pass ``m.marginals`` to compare marginals.
+    The maps may be of different methods. Raises ConfigError if their voxels are of different sizes.
     """
     a, b = a.decided, b.decided
     if a.config.volume.origin != b.config.volume.origin:

@@ -1,8 +1,8 @@
-"""The distance to the nearest obstacle, and the way that leads away from it: what planners ask.
+"""Distances to the nearest obstacle, with their gradients, for planners.
 
 The distances are exact at the centres of voxels and linear between them along each axis, so that the
-gradient is that of what is returned. They are cut off at a stated distance, which bounds what a change of the
-map reaches.
+gradient is exactly that of the returned distance. They are clamped at a given distance, which bounds the
+effect of a change in the map.
 """
 
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ class PointsInPlace(Bundle):
 
 @dataclass(frozen=True)
 class PointsMoved(Bundle):
-    """What PointsInPlace.split says of each point, (N, 3) each: devices that may lack float64."""
+    """Results of PointsInPlace.split for each point, (N, 3) each, for devices that may lack float64."""
 
     voxels: I32Array2
     shares: F32Array2
@@ -217,13 +217,13 @@ class DistanceField(Owned):
         upper: ArrayLike | None = None,
         level: float | None = None,
     ) -> None:
-        """Work out the distances of a map as it is now.
+        """Compute the distances of a map as it is now.
 
-        ``unknown`` says what unknown voxels are: "free" space, "occupied", which makes them obstacles, or
-        "unknown": no obstacles, and in them the distance is NaN. ``lower`` and ``upper``, (3,) in
-        metres, bound the field to a box, outside of which all is NaN; obstacles around it count.
-        With a ``level``, free voxels that are not free at that level (``m.free_with``) are obstacles, so that
-        distances are lower bounds; with ``unknown="occupied"``, all that is not free at the level is.
+        ``unknown`` is the treatment of unknown voxels: "free" space; "occupied", that is, obstacles; or
+        "unknown": no obstacles, but the distance in them is NaN. ``lower`` and ``upper``, (3,) in metres,
+        limit the field to a box, outside which all is NaN; obstacles around it count. With a ``level``, free
+        voxels that are not free at that level (``m.free_with``) are obstacles, so that distances are lower
+        bounds; with ``unknown="occupied"``, everything that is not free at the level is.
 
         Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, corners
         that make no box, and a level that the map cannot promise (then also :meth:`update`); CapacityError if
@@ -248,12 +248,12 @@ class DistanceField(Owned):
 
     @property
     def bytes(self) -> int:
-        """Bytes of memory that the field takes."""
+        """Memory of the field in bytes."""
         return self._bricks.bytes
 
     def update(self, m: VoxelMap | None = None) -> int:
-        """Update the distances that have changed with the map since the last call; returns the number of
-        their voxels. ``m`` is another map to follow from now on, such as a later layer or reading, with
+        """Update the distances that changes of the map since the last call affect; returns the number of
+        updated voxels. ``m`` is another map to follow from now on, such as a later layer or reading, with
         voxels of the same size.
 
         Raises ConfigError for voxels of another size, CapacityError if there is not enough memory; after
@@ -262,8 +262,8 @@ class DistanceField(Owned):
         if m is not None:
             if not np.isclose(m.voxel_size, self.map.voxel_size, rtol=1e-6):
                 raise ConfigError(
-                    f"a distance field of voxels of {self.map.voxel_size:g} m cannot follow a map of voxels "
-                    f"of {m.voxel_size:g} m"
+                    f"a distance field with voxels of {self.map.voxel_size:g} m cannot follow a map with "
+                    f"voxels of {m.voxel_size:g} m"
                 )
             self.map = m
         if not self._complete:
@@ -276,7 +276,7 @@ class DistanceField(Owned):
 
     @tensors.in_kind("points", on_device=True)
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Metres to the nearest obstacle at points (N, 3) in metres, (N,) float32; NaN where it is not known.
+        """Metres to the nearest obstacle at points (N, 3) in metres, (N,) float32; NaN where unknown.
         Raises ConfigError for points of another shape or that are not finite."""
         given = tensors.real_array(points, "points", ("N", 3))
         out = tensors.empty(given, given.shape[:1])
@@ -287,9 +287,9 @@ class DistanceField(Owned):
 
     @tensors.in_kind("points", on_device=True)
     def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Distances of points as :meth:`distance` has them, and their gradients: the change for each metre
-        along x, y and z, (N, 3) float32. A gradient points away from the nearest obstacle, with a length of
-        nearly 1, and is 0 where the distance is cut off. Raises ConfigError."""
+        """Distances of points as in :meth:`distance`, and their gradients: the change per metre along x, y
+        and z, (N, 3) float32. A gradient points away from the nearest obstacle, with a length of nearly 1,
+        and is 0 where the distance is clamped. Raises ConfigError."""
         given = tensors.real_array(points, "points", ("N", 3))
         out, gradient = tensors.empty(given, given.shape[:1]), tensors.empty(given, given.shape)
         if len(given):
@@ -301,10 +301,10 @@ class DistanceField(Owned):
 
     @tensors.in_kind("centres", "radii_m", on_device=True)
     def clearance(self, centres: ArrayLike, radii_m: ArrayLike) -> NDArray[np.float32]:
-        """Distance of bodies made of balls from obstacles: centres (C, S, 3) of S balls for each of C bodies
-        or configurations, in metres, and their radii (S,) -> (C,) float32, the least distance of a centre
-        less its radius. It is positive if no ball reaches an obstacle, and NaN if the distance of one is not
-        known.
+        """Clearance of bodies made of balls: centres (C, S, 3) of S balls for each of C bodies or
+        configurations, in metres, and their radii (S,) -> (C,) float32, the smallest distance of a centre
+        minus its radius. It is positive if no ball touches an obstacle, and NaN if the distance of any ball
+        is unknown.
 
         Raises ConfigError for arrays that do not fit or are not finite, and for radii that are negative or
         not less than ``max_distance_m``.

@@ -211,8 +211,8 @@ class DistanceBricks:
     def _grow(self, needed: int) -> None:
         if needed > _MOST_BRICKS:
             raise CapacityError(
-                f"distances in {needed} bricks of {BRICK}^3 voxels are needed and the most is "
-                f"{_MOST_BRICKS}; choose a smaller max_distance_m, a box, or larger voxels"
+                f"distances need {needed} bricks of {BRICK}^3 voxels, but at most "
+                f"{_MOST_BRICKS} are possible; choose a smaller max_distance_m, a box, or larger voxels"
             )
         capacity = max(needed, min(_MOST_BRICKS, int(self._capacity * _GROWTH)), _LEAST_CAPACITY)
         check_memory(

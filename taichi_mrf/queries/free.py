@@ -78,7 +78,7 @@ class FreePromise:
         return {"says": self.sentence(), "blocks": self.blocks, "levels": self.levels.tolist(), **figures}
 
     def sentence(self, level: float = DEFAULT_LEVEL) -> str:
-        """How far free space is promised at one of the levels, in one line."""
+        """The promise at one of the levels, in one line."""
         i = int(np.argmin(np.abs(self.levels - level)))
         if not self.blocks:
             return f"promised at {level:.0%} by the default table: no frames were held out"
@@ -191,7 +191,7 @@ def bound_now(m: Any, level: float) -> float:
     """Log-odds below which free voxels of a map are free at a level. Raises ConfigError for a level that is
     not promised, in a map that is not settled, and in maps in chunks, which promise nothing."""
     if not hasattr(m, "promise"):
-        raise ConfigError("a map in chunks promises no level of free space: ask the map that it was made of")
+        raise ConfigError("a map in chunks promises no level of free space: ask the map it was made from")
     if not getattr(m, "settled", True):
         raise ConfigError("the map has changed since it was inferred, and promises nothing: call infer()")
     return (m.promise or default_promise(m)).most_log_odds(level)

@@ -79,8 +79,8 @@ class Frontiers:
 
 def find_frontiers(m: VoxelMap, min_voxels: int = 1) -> Frontiers:
     """All free voxels that share a face with an unknown one. Those that touch, even at a corner, form one
-    cluster; clusters of fewer than ``min_voxels`` are left out. A voxel that was seen well, but is unknown
-    because some rays end in it (inference/thin_matter.py), makes no frontier.
+    cluster; clusters of fewer than ``min_voxels`` are left out. A well-observed voxel that is unknown only
+    because some rays end in it (inference/thin_matter.py) makes no frontier.
 
     The map is read chunk by chunk, so that memory is bounded by the result. Raises ConfigError for min_voxels
     below 1.

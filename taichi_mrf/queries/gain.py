@@ -43,8 +43,8 @@ def view_gain(
 ) -> NDArray[np.float64]:
     """Information gain of views, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
 
-    The sum of :func:`pixel_gain` over the image. A voxel counts once for each ray that crosses it, so compare
-    only views of one camera; few pixels are enough to rank them. Raises the errors of pixel_gain.
+    The gain is the sum of :func:`pixel_gain` over the image. A voxel counts once for each ray that crosses
+    it, so compare only views of one camera; few pixels suffice to rank them. Raises the errors of pixel_gain.
     """
     poses = np.asarray(T_world_camera, np.float64)
     if poses.ndim == 2:

@@ -14,13 +14,13 @@ from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import CROSSED, Topology
 
 UNKNOWN = 0
-"""The state of a place that no ray has crossed, or that has too little evidence either way."""
+"""State of a place that no ray has crossed, or with too little evidence either way."""
 
 FREE = 1
-"""The state of a place that was seen to be empty."""
+"""State of a place that was observed to be empty."""
 
 OCCUPIED = 2
-"""The state of a place that is more likely occupied than not."""
+"""State of a place that is more likely occupied than not."""
 
 
 def point_log_odds(

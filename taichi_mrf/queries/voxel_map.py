@@ -1,4 +1,4 @@
-"""The interface of a map that is read: what queries, exporters and evaluation use, whatever holds the voxels.
+"""Read-only interface of a map, for queries, exporters and evaluation, whatever stores the voxels.
 
 Maps of all methods have it (methods/brick_map.py), and so have a map of another time or by what is occupied
 (methods/mrf/map_reading.py) and a box of a map in chunks (methods/chunked_part.py).
@@ -73,11 +73,11 @@ class PixelReader(Protocol):
 
 
 class VoxelMap(PixelReader, Protocol):
-    """Bricks of voxels that were measured by a sensor."""
+    """Bricks of voxels measured by a sensor."""
 
     voxel_size: float
     view: View
-    """Follows rays through the map."""
+    """Casts rays through the map."""
 
     @property
     def config(self) -> Config: ...
@@ -114,7 +114,7 @@ class VoxelMap(PixelReader, Protocol):
         ...
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32, by what is ``decided``."""
+        """Probability of occupied at (N, 3) points in metres, (N,) float32, as in ``decided``."""
         ...
 
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
@@ -122,7 +122,7 @@ class VoxelMap(PixelReader, Protocol):
         ...
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Voxels of at least this probability, by what is ``decided``: centres (N, 3) in metres, and (N,)."""
+        """Voxels of at least this probability, as in ``decided``: centres (N, 3) in metres, and (N,)."""
         ...
 
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
@@ -130,7 +130,7 @@ class VoxelMap(PixelReader, Protocol):
         ...
 
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
-        """The probability that a ball hits something on a path (N, 3) -> (), or paths (P, N, 3) -> (P,)."""
+        """The probability that a ball collides along a path (N, 3) -> (), or paths (P, N, 3) -> (P,)."""
         ...
 
     def render_depth(
@@ -148,7 +148,7 @@ class VoxelMap(PixelReader, Protocol):
 
     @property
     def has_surface(self) -> bool:
-        """True if it holds the surface of all keyframes that it was made of."""
+        """True if it holds the surface measured by all its keyframes."""
         ...
 
     def surface(self) -> Any:

@@ -1,4 +1,4 @@
-"""Cameras: how pixels become rays. The pinhole, and what any other kind has to answer.
+"""Cameras, which turn pixels into rays: the pinhole, and the interface of any other kind.
 
 Kernels get their part of a camera from ``in_kernels``; importing this file does not load Taichi.
 """
@@ -26,7 +26,7 @@ _NO_SKEW = 1e-6
 class Camera(Protocol):
     """Interface of a camera, as mapping needs it.
 
-    A camera is immutable, equal to another that maps pixels to the same rays, and so is its ``repr``.
+    A camera is immutable; cameras with the same rays are equal, and have the same ``repr``.
     Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if they
     have the length 1.
 
@@ -233,8 +233,8 @@ class PinholeCamera(Stored):
 
 
 def pinhole(camera: Camera, who: str) -> PinholeCamera:
-    """The camera, for what works with pinholes alone. Raises ConfigError for any other: ``who``, such as
-    "--undistort", begins its text."""
+    """The camera, where only a pinhole works. Raises ConfigError for any other; its text begins with ``who``,
+    such as "--undistort"."""
     if not isinstance(camera, PinholeCamera):
         raise ConfigError(f"{who} needs a pinhole camera, not a {type(camera).__name__}")
     return camera

@@ -1,4 +1,4 @@
-"""A pinhole camera whose lens bends rays, by OpenCV's model: the ray of each pixel is undistorted once."""
+"""A pinhole camera with lens distortion, by OpenCV's model: each pixel's ray is undistorted once."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""One measurement of a depth camera or a lidar, whatever it was recorded with."""
+"""One measurement of any depth camera or lidar."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

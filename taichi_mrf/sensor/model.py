@@ -77,7 +77,7 @@ class Sensor(Bundle):
 
     @ti.func
     def until(self, measured: F32, last: F32):
-        """Where the ray of a measurement stops of which ``last`` is the end of its evidence."""
+        """End of the ray of a measurement; ``last`` is where its evidence ends."""
         return last
 
     @ti.func

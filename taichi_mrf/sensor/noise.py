@@ -128,7 +128,7 @@ class StoredNoise(Stored):
         """As NoiseModel has it."""
 
     def curves(self, depth_m: NDArray[np.float64]) -> Curves:
-        """What pictures show at depths (n,) in metres: here of (patches, TERMS) coefficients."""
+        """Curves for plots at depths (n,) in metres, here those of (patches, TERMS) coefficients."""
         return _curves(self.sigma, self.bias, depth_m)
 
 
@@ -232,10 +232,10 @@ class WidenedNoise(StoredNoise):
 
 def load_noise(path: str | Path) -> StoredNoise:
     """The noise model of an .npz with its ``stored_arrays``. Raises ConfigError, which names the file."""
-    with npz_file.open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
+    with npz_file.open_npz(Path(path), ConfigError, "a readable noise table") as file:
         found = read_stored(file)
     if not isinstance(found, StoredNoise):
-        raise ConfigError(f"{path}: holds a {type(found).__name__}, which is no noise model")
+        raise ConfigError(f"{path}: holds a {type(found).__name__}, not a noise model")
     return found
 
 

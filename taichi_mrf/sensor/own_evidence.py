@@ -1,4 +1,4 @@
-"""Evidence that one keyframe states of its own measurements, in place of what its map assumes of all."""
+"""Evidence that a keyframe states about its own measurements, in place of its map's assumptions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -134,13 +134,13 @@ def checked_no_return(
 def sigma_of_confidence(
     confidence: ArrayLike, depth_m: ArrayLike, noise: NoiseModel, camera: Camera, least: float = 0.1
 ) -> NDArray[np.float32]:
-    """A sigma for each pixel, (H, W) metres, from a confidence between 0 and 1: that of the noise model at
+    """A sigma for each pixel, (H, W) metres, from a confidence between 0 and 1: the noise model's sigma at
     the measured depth, divided by the confidence.
 
-    A confidence of 1 or more leaves the model's sigma. One below ``least`` counts as ``least``, so that sigma
-    is at most 1 / ``least`` times the model's. 0, negative and NaN mean that the pixel is no measurement: its
-    sigma is infinite. Levels, such as ARKit's 0 to 2, have to be scaled first. Raises ConfigError for a wrong
-    shape.
+    A confidence of 1 or more keeps the model's sigma. One below ``least`` counts as ``least``, so that sigma
+    is at most 1 / ``least`` times the model's. 0, negative and NaN mean that the pixel holds no measurement:
+    its sigma is infinite. Levels, such as ARKit's 0 to 2, have to be scaled first. Raises ConfigError for a
+    wrong shape.
     """
     share, depth = array(confidence, "confidence"), array(depth_m, "depth_m")
     if share.shape != camera.shape or depth.shape != camera.shape:

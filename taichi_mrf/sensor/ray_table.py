@@ -1,4 +1,4 @@
-"""Cameras that are a table with the direction of each pixel: free rays, and the base of spherical cameras."""
+"""Cameras given by a table of each pixel's direction: arbitrary rays, and the base of spherical cameras."""
 
 import copyreg
 import hashlib
@@ -33,8 +33,8 @@ def largest_turn(directions: NDArray[np.float64]) -> float:
 
 
 def cone_span(half_angle: float) -> int | None:
-    """How many cells along each side a cone of ``half_angle`` radians can touch at most, for
-    :func:`most_in_span`; None if that may be all.
+    """Largest number of cells along each side that a cone of ``half_angle`` radians can touch, for
+    :func:`most_in_span`; None if it may touch all.
 
     The directions in a cone lie in a ball around its axis' end on the unit sphere, hence in a cube, and hence
     in the cells that the cube can touch.
@@ -74,7 +74,7 @@ def morton_order(units: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def _in_steps(units: NDArray[np.float64], steps: int) -> NDArray[np.int64]:
-    """Which of so many steps from -1 to 1 each component lies in."""
+    """Index of the step, of ``steps`` from -1 to 1, that each component lies in."""
     return np.clip(np.floor((units + 1.0) * (steps / 2)), 0, steps - 1).astype(np.int64)
 
 
@@ -211,7 +211,7 @@ class RayTable(Stored):
 
     @cached_property
     def digest(self) -> str:
-        """A text that tells these rays from all others."""
+        """A text that distinguishes these rays from all others."""
         content = hashlib.blake2b(repr((self.shape, self.has_pattern)).encode(), digest_size=16)
         content.update(self._table.tobytes())
         if self._origins is not None:

@@ -34,7 +34,7 @@ class Stored(ABC):
     @classmethod
     @abstractmethod
     def of_arrays(cls: type[StoredT], file: "Arrays") -> StoredT:
-        """The same again. Raises the errors of the class's constructor, and the file's for wrong arrays."""
+        """Rebuild the object. Raises the constructor's errors, and the file's error for wrong arrays."""
 
 
 class Arrays:
@@ -71,7 +71,7 @@ def stored_arrays(thing: object, prefix: str = "", what: str = "a noise model") 
     """A camera or a noise model as arrays by name. Raises MapFileError for one that cannot be saved."""
     if not isinstance(thing, Stored):
         name = type(thing).__name__
-        raise MapFileError(f"{what} of type {name} cannot be saved: its class has not the base Stored")
+        raise MapFileError(f"{what} of type {name} cannot be saved: its class is not derived from Stored")
     arrays = thing.arrays()
     if type(thing).arrays is not _told(arrays).arrays:
         arrays = {**arrays, _KIND: np.asarray(type(thing).__name__)}
@@ -84,7 +84,7 @@ def is_stored(file: "NpzFile", prefix: str) -> bool:
 
 
 def read_stored(file: "NpzFile", prefix: str = "") -> Any:
-    """What :func:`stored_arrays` has made. Raises the file's error, also for a class that is neither of this
+    """The object that :func:`stored_arrays` stored. Raises the file's error, also for a class that is neither of this
     package nor imported."""
     found, what = Arrays(file, prefix), prefix.rstrip("_") or "the noise"
     name = found.array(_KIND, "U", ()).item() if _KIND in found else None

@@ -46,7 +46,7 @@ def computed_rows(connection: sqlite3.Connection) -> str | None:
     rows = connection.execute("SELECT type, name, sql LIKE 'CREATE VIRTUAL%' FROM sqlite_master").fetchall()
     for kind, name, is_virtual in rows:
         if kind == "view" or is_virtual:
-            return f"{name} is no table with rows of its own"
+            return f"{name} is not a table with rows of its own"
         columns = connection.execute("SELECT name, hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
         if kind == "table" and any(hidden for _, hidden in columns):
             return f"{name} has columns that are computed"

@@ -101,7 +101,7 @@ def name() -> str:
     asked = os.environ.get(VARIABLE, "")
     if asked:
         if asked not in COMPILERS:
-            raise BackendError(f"unknown compiler '{asked}' in {VARIABLE}; known are {', '.join(COMPILERS)}")
+            raise BackendError(f"unknown compiler '{asked}' in {VARIABLE}; use {', '.join(COMPILERS)}")
         if not _is_installed(asked):
             install = COMPILERS[asked].install
             raise BackendError(f"{VARIABLE} is '{asked}', which is not installed: pip install {install}")
@@ -145,7 +145,7 @@ def kernel_class() -> Any:
 
 
 def kernels_of(kernel: Any) -> dict[Any, Any]:
-    """What was made of a kernel's source so far, by the types of its arguments."""
+    """The compiled forms of a kernel so far, by the types of its arguments."""
     made: dict[Any, Any] = getattr(kernel, COMPILERS[name()].made)
     return made
 

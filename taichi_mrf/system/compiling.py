@@ -38,7 +38,7 @@ _unlaunched: set[Any] = set()
 
 
 class Waiting:
-    """How long the compiler has worked since the last step: says so once that is worth a word."""
+    """Time spent compiling since the last step, reported once it is worth a word."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         self._tell = tell

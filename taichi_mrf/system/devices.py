@@ -112,7 +112,7 @@ def cuda_device() -> str:
 
 
 def cuda_device_count() -> int:
-    """How many CUDA devices this process may use; 0 also where there is no driver."""
+    """Number of CUDA devices that this process may use; 0 also without a driver."""
     try:
         return _cuda_devices()[1]
     except BackendError:

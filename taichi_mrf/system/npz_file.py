@@ -212,5 +212,5 @@ def _read_header(stream: Any) -> tuple[Shape, bool, np.dtype]:
     read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(stream)
     if dtype.hasobject or len(shape) > _MOST_DIMENSIONS or any(n < 0 for n in shape):
-        raise ValueError(f"{dtype} {shape} is no array of plain values")
+        raise ValueError(f"{dtype} {shape} is not an array of plain values")
     return tuple(shape), fortran, dtype

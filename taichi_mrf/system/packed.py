@@ -18,7 +18,7 @@ DEFLATE_RATIO = 1032
 LEAST_BYTES, LARGEST_RATIO = 1 << 28, 100
 
 TEXT = 8
-"""What a byte of text counts for: numbers and lists that are made of it take so many and more."""
+"""Weight of a byte of text: the numbers and lists made from it take that many bytes and more."""
 
 
 class UnpackedBytes:

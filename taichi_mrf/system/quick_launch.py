@@ -17,7 +17,7 @@ import numpy as np
 from taichi_mrf.system import compiler
 
 Decide = Callable[[Any], object]
-"""What decides of an argument which compiled kernel is launched."""
+"""The property of an argument that decides which compiled kernel is launched."""
 
 SetArgument = Callable[[Any, Any], None]
 """Sets the argument of a kernel, in the context of its launch."""
@@ -31,7 +31,7 @@ class _LeftToTaichiError(Exception):
 
 
 class _Plan:
-    """How the arguments of one kernel are set, and the kernels that were compiled of it."""
+    """Setters for the arguments of one kernel, and its compiled forms."""
 
     def __init__(self, kernel: Any, kinds: list[str]) -> None:
         self.made: Any = None  # the kernel's own table of ``known``; it has another one after ``ti.reset``

@@ -1,7 +1,7 @@
-"""Starts Taichi once, on the best backend of this machine, and records why it was chosen.
+"""Starts Taichi once, on the best backend of this machine, and records the reason for the choice.
 
-A process has one backend, and one compiler of kernels (system/compiler.py): what is said of Taichi here holds
-for Quadrants too. Importing this module neither loads nor starts one.
+A process has one backend, and one compiler of kernels (system/compiler.py): everything about Taichi here also
+holds for Quadrants. Importing this module neither loads nor starts a compiler.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ SOFTWARE_BLOCK = 8
 
 @dataclass(frozen=True)
 class Backend:
-    """The chosen backend, and why those tried before it were rejected."""
+    """The chosen backend, and the reasons why those tried before it were rejected."""
 
     name: str
     device: str
@@ -84,7 +84,7 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
     """
     global _chosen
     if arch not in ("auto", *BACKENDS):
-        raise BackendError(f"unknown backend '{arch}'; known are auto, {', '.join(BACKENDS)}")
+        raise BackendError(f"unknown backend '{arch}'; choose from auto, {', '.join(BACKENDS)}")
     with _starting:
         if _chosen is not None:
             owner.check_owner()

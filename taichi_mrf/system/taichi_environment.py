@@ -19,7 +19,7 @@ _BASE = "XDG_CACHE_HOME"
 _MATPLOTLIB = "MPLCONFIGDIR"
 
 cache_note: str | None = None
-"""Why Taichi's compiled kernels are not in the usual folder, and where they are."""
+"""Reason why Taichi's compiled kernels are not in the usual folder, and their actual folder."""
 
 
 def prepare() -> None:
@@ -61,11 +61,11 @@ def first_run_note() -> str | None:
 
 
 def cache_problem() -> str | None:
-    """Why Taichi must not be started, if its cache has no folder that can be written to."""
+    """Reason why Taichi must not be started: its cache has no writable folder. None if it has one."""
     folder = cache_folder()
     if os.name == "nt" or (folder is not None and _is_writable(folder)):
         return None
-    return f"no folder can be written to for {compiler.title()}'s compiled kernels: set {cache_variable()}"
+    return f"no writable folder for {compiler.title()}'s compiled kernels: set {cache_variable()}"
 
 
 def _choose_cache() -> None:

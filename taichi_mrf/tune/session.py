@@ -188,7 +188,7 @@ class TuneSession(SessionCore):
 
     def _start_search(self, request: t.StartSearch) -> None:
         if self._searching:
-            raise ConfigError("a search is going on: stop it first")
+            raise ConfigError("a search is running: stop it first")
         search = Search(self._config, (), request.tries, seed=0, objective=request.objective)
         self._begin(self.frames.choice, search)
 

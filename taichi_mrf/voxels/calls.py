@@ -1,4 +1,4 @@
-"""What rays say of a voxel beyond its marginal, as the layer FIRST of a store: one byte.
+"""The verdict of the rays on a voxel beyond its marginal, one byte: the layer FIRST of a store.
 
 0 is nothing. WON is a voxel that is occupied by the vote of the rays, DOUBTED one that is not called free. A
 larger byte is a voxel that is occupied by its score, in tenths of a nat the byte plus SCORED

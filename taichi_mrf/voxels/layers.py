@@ -27,9 +27,9 @@ Chunk = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class OnPage:
-    """How the page shows a layer that pixels feed: the name of its ``coloring`` there, its ``help``, and the
-    ``caption`` of its legend with a ``key``, RGB by what it means. ``painted`` is the module and the name of
-    a function from values (n, 512, ...) to RGB (n, 512, 3), colors.NO_COLOR where nothing is known."""
+    """Display of a layer that pixels feed: the name of its ``coloring`` on the page, its ``help``, and the
+    ``caption`` of its legend with a ``key``, RGB by meaning. ``painted`` is the module and the name of a
+    function from values (n, 512, ...) to RGB (n, 512, 3), colors.NO_COLOR where nothing is known."""
 
     coloring: str
     help: str
@@ -40,13 +40,13 @@ class OnPage:
 
 @dataclass(frozen=True)
 class FromPixels:
-    """How a layer follows from an image beside depth.
+    """Derivation of a layer from an image beside depth.
 
     ``image`` is the argument of ``add_keyframe``, or the name among its ``images``; ``channels`` uint8 of a
     pixel, all 0 where it says nothing. ``visitor`` is the module and the class of its PixelVisitor, loaded
     when a map is first asked for the layer. A voxel's sums are int64 ``words``, each of which holds two
     numbers; ``stored`` and the words' names are those of what frozen keyframes gave, in files. ``page`` is
-    how it is shown.
+    its display.
     """
 
     image: str
@@ -58,7 +58,7 @@ class FromPixels:
 
 
 def imported(place: str) -> Any:
-    """What a module and a name stand for, imported now."""
+    """The object that a module and a name stand for, imported now."""
     module, _, name = place.partition(":")
     return getattr(importlib.import_module(module), name)
 

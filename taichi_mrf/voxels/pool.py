@@ -274,8 +274,8 @@ class BrickPool:
     def _grow(self, bricks_needed: int) -> None:
         if bricks_needed > MOST_BRICKS:
             raise CapacityError(
-                f"the map would hold {bricks_needed * VOXELS:.3g} voxels and the most is "
-                f"{MOST_BRICKS * VOXELS:.3g}; choose larger voxels"
+                f"the map would hold {bricks_needed * VOXELS:.3g} voxels, but at most "
+                f"{MOST_BRICKS * VOXELS:.3g} are possible; choose larger voxels"
             )
         check_memory(
             bricks_needed * VOXELS * self.bytes_per_voxel,

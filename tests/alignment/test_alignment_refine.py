@@ -107,7 +107,7 @@ def test_a_keyframe_that_is_not_moved_changes_nothing(whole: MRFMap) -> None:
     pose = whole.keyframes[5].T_world_camera
     refined = whole.refine_pose(5, PoseConfig(min_overlap=1.0))
     assert not refined.accepted
-    assert "of its points lie near what others have measured, and 100% are needed" in refined.reason
+    assert "of its points lie near what others have measured, but 100% are needed" in refined.reason
     np.testing.assert_array_equal(whole.keyframes[5].T_world_camera, pose)
     np.testing.assert_array_equal(whole.occupancy(probes()), before)
 

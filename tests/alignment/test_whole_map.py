@@ -215,7 +215,7 @@ def test_a_few_views_are_too_little(yesterday: MRFMap) -> None:
     frames = [room_frames()[index] for index in TODAY[:5]]
     assert located(yesterday, frames, turned_away()).T_map_recording is not None
     assert (
-        located(yesterday, frames[:4], turned_away()).reason == "too little seen: 4 views, and 5 are needed"
+        located(yesterday, frames[:4], turned_away()).reason == "too little seen: 4 views, but 5 are needed"
     )
 
 

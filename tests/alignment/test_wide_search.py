@@ -128,7 +128,7 @@ def test_a_scan_after_a_jump_is_found(yaw: float, tilt: float) -> None:
 
 def test_a_corridor_that_is_the_same_everywhere_is_no_place() -> None:
     with pytest.raises(
-        LostFrameError, match=r"scan 1: tracking lost: .* (alike at two places|six directions)"
+        LostFrameError, match=r"scan 1: tracking lost: .* (two places equally well|six directions)"
     ):
         followed(corridor(), place(0, 0.3, 0), place(1.5, -0.4, 1.5))
 

@@ -75,7 +75,7 @@ def test_the_command_says_who_is_missing(
     assert set(report["rows"][0]["rates"]) == NAMES
     assert "distance and gradient" in said
     for name in ("OctoMap", "Open3D"):
-        line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
+        line = f"{name} is left out: pip install 'taichi-mrf[bench]' adds it."
         assert (line in said) == (name in queries.missing_peers())
 
 

@@ -289,7 +289,7 @@ def test_flags_that_do_not_go_together_are_refused(tmp_path: Path, refused: Refu
     assert "--camera-poses and --board-poses go together" in refused(
         depth, "--images", depth, "--board-poses", depth
     )
-    assert "not in whole pixels" in refused(
+    assert "not a whole number of pixels" in refused(
         depth, "--true-depth", depth, "--camera", "8.5", "6", "9", "9", "4", "3"
     )
     assert "degree must lie between 0 and 4" in refused(depth, "--true-depth", depth, "--degree", "7")

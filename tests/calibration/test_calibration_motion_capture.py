@@ -93,7 +93,7 @@ def test_streams_that_do_not_belong_together_are_refused() -> None:
     capture = captured(0.0, SECONDS, np.random.default_rng(0))
     poses = board_motion(STAMPS)
     faster = TimedPoses(capture.board.stamps, capture.board.poses[::-1])
-    with pytest.raises(DatasetError, match="does not move in the images as in motion capture"):
+    with pytest.raises(DatasetError, match="motion in the images does not match motion capture"):
         estimate_lag(STAMPS, poses, BodyPair(capture.camera, faster), OPTIONS)
     later = TimedPoses(capture.board.stamps + 100, capture.board.poses)
     with pytest.raises(DatasetError, match="overlap too little"):

@@ -256,7 +256,7 @@ def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> 
     batch = taichi_mrf("map", "synthetic:room?frames=3", *other[1:])
     assert_refused(batch, "config.yaml: made with another voxel_size", "--overwrite")
     assert (tmp_path / "report.json").read_bytes() == before
-    assert f"{tmp_path} holds this run already" in mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    assert f"{tmp_path} already holds this run" in mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     assert (tmp_path / "report.json").read_bytes() == before
     for stale in ("surface.png", "perspective.png", "top_view.png", "depth.png", "trajectory.txt"):
         (tmp_path / stale).touch()
@@ -277,7 +277,7 @@ def test_a_run_without_a_voxel_size_takes_what_fits_and_is_the_same_run_again(
     said = mapped(recording, *words)
     assert "voxel_size is 0.1 m" in said
     assert load(tmp_path / "out" / "config.yaml").voxel_size == 0.1
-    assert "holds this run already" in mapped(recording, *words)
+    assert "already holds this run" in mapped(recording, *words)
     finer = taichi_mrf("map", recording, *words, "--voxel-size", "5cm")
     assert_refused(finer, "another voxel_size", "--overwrite")
 

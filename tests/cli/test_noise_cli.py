@@ -61,7 +61,7 @@ def test_a_noise_is_learnt_and_used_again(tmp_path: Path, learnt: Path) -> None:
     sensor = load(learnt / "config.yaml").sensor
     assert (sensor.sigma_scale, sensor.sigma_added) != (1.0, 0.0)
     assert yaml.safe_load((learnt / "sensor.yaml").read_text())["sensor"]["sigma_scale"] == sensor.sigma_scale
-    assert "holds this run already" in mapped(ROOM, "--out", learnt, *LEARN)
+    assert "already holds this run" in mapped(ROOM, "--out", learnt, *LEARN)
 
     done = taichi_mrf("map", ROOM, "--out", again, *FLAGS, "--config", learnt / "sensor.yaml")
     assert done.returncode == 0, done.stderr
@@ -148,7 +148,7 @@ def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
     assert "noise_from" not in report_of(learns)
     assert report_of(tmp_path / "given")["noise_from"] == "given"
     same = taichi_mrf("map", ROOM, "--out", learns, "--limit", "3", *FAST)
-    assert "holds this run already" in same.stdout
+    assert "already holds this run" in same.stdout
     other = taichi_mrf("map", ROOM, "--out", learns, "--limit", "3", *FAST, *given)
     assert_refused(other, "noise_from")
 

@@ -116,5 +116,5 @@ def test_quiet_and_verbose_runs(tmp_path: Path) -> None:
     assert "Adding 2 of 2" in verbose.stderr
     assert "Adding" not in verbose.stdout
     assert_refused(
-        taichi_mrf(*FAST_ROOM, "--out", tmp_path / "c", "--quiet", "--verbose"), "do not go together"
+        taichi_mrf(*FAST_ROOM, "--out", tmp_path / "c", "--quiet", "--verbose"), "cannot be combined"
     )

@@ -93,5 +93,5 @@ def test_a_stopped_run_goes_on_with_its_chunks(tmp_path: Path) -> None:
 
 
 def test_submaps_refuse_a_window() -> None:
-    with pytest.raises(ConfigError, match=r"volume.window_m does not go with submaps"):
+    with pytest.raises(ConfigError, match=r"volume.window_m does not work with submaps"):
         _check(Config(volume=VolumeConfig(window_m=3.0)), 1)

@@ -110,7 +110,7 @@ def test_a_topic_of_poses_of_two_bodies_is_refused_or_chosen(make: Make) -> None
     refused(path, "topic /odom: poses are of several frames", f"?body={BODY} or ?body=trailer")
     check_poses(open_dataset(f"{path}?body={BODY}"))
     same = partial(odometry, T=AWAY, late=0.01)
-    refused(make(images, mounted, odometry, same), "topic /odom: its poses jump to and fro")
+    refused(make(images, mounted, odometry, same), "topic /odom: its poses jump back and forth")
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_a_clock_that_starts_again_begins_a_run(
     path = make(mounted, write, kind=kind)
     first = open_dataset(path)
     check_poses(first, count=LONG)
-    (note,) = (note for note in first.notes if "clock starts again" in note)
+    (note,) = (note for note in first.notes if "clock restarts" in note)
     assert "run 1 (" in note
     assert f"{LONG - 1} images" in note
     second = open_dataset(f"{path}?run=2")

@@ -132,7 +132,7 @@ def test_late_poses_are_interpolated_in_their_own_times(tmp_path: Path) -> None:
     assert len(plain) == len(stamps)
     dataset = open_dataset(folder, camera=CAMERA, poses_are=f"late={0.45 * step}")
     assert len(dataset) == len(stamps)
-    assert not any("poses of frames alone" in note for note in dataset.notes)
+    assert not any("only the poses of frames" in note for note in dataset.notes)
     found = [dataset.read(i).T_world_camera[0, 3] for i in range(len(dataset))]
     expected = [place(t + 0.45 * step)[0, 3] for t in stamps]
     np.testing.assert_allclose(found, expected, atol=0.06)
@@ -144,7 +144,7 @@ def test_where_a_recording_has_pairs_alone_late_says_so(tmp_path: Path) -> None:
     plain = open_dataset(folder)
     gap = float(plain.stamps()[1] - plain.stamps()[0])
     dataset = open_dataset(folder, poses_are=f"late={gap / 2}")
-    assert any("has the poses of frames alone" in note for note in dataset.notes)
+    assert any("has only the poses of frames" in note for note in dataset.notes)
 
 
 def test_depth_along_the_ray_becomes_axial(tmp_path: Path) -> None:

@@ -43,18 +43,18 @@ def test_sources_without_a_recording(tmp_path: Path) -> None:
     for name in ("pose", "depth"):  # the folders of ScanNet, with depth of another kind
         (tmp_path / name).mkdir()
     (tmp_path / "depth" / "0.exr").write_bytes(b"something")
-    refused(tmp_path, "not read (0.exr)")
+    refused(tmp_path, "unsupported format (0.exr)")
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    refused(tmp_path, "not read (0.exr); write them as an .npz with depth_m")
+    refused(tmp_path, "unsupported format (0.exr); write them as an .npz with depth_m")
 
 
 UNREAD = {
-    "a.exr": "not read (a.exr); write them as an .npz with depth_m",
-    "a.hdf5": "not read (a.hdf5)",
-    "a.npy": "not read (a.npy)",
+    "a.exr": "unsupported format (a.exr); write them as an .npz with depth_m",
+    "a.hdf5": "unsupported format (a.hdf5)",
+    "a.npy": "unsupported format (a.npy)",
     "a.zip": "is an archive; unpack it",
     "a.tar.gz": "is an archive; unpack it",
-    "a.mp4": "is a film: it has colours, and a map is made of depth",
+    "a.mp4": "is a video: it has colours, but a map needs depth",
     "a.svo": "a camera maker's own format",
     "a.fbx": "converted to .ply or .glb",
     "a.obj": "renders depth images of a mesh",
@@ -87,7 +87,7 @@ def test_only_colours(tmp_path: Path, suffix: str, place: str) -> None:
 def test_depth_images_of_other_names(tmp_path: Path, suffix: str) -> None:
     for i, image in enumerate(Content(2).depth):
         write_image(tmp_path / f"view{i}{suffix}", image)
-    refused(tmp_path, f"of depth (view0{suffix}) in a layout that is not read")
+    refused(tmp_path, f"of depth (view0{suffix}) in an unsupported layout")
     refused(tmp_path / f"view0{suffix}", f"is one image of depth (view0{suffix})")
 
 
@@ -159,9 +159,9 @@ def test_a_scale_or_a_time_gap_that_is_none(folder: Path, option: str, value: fl
         ("camera.txt", "640 480 fx fy 1 1", "not a number"),
         ("camera.txt", "16 12 -14 15 7.5 5.5", "both must be positive"),
         ("camera.txt", "16 12 nan 15 7.5 5.5", "fx is not finite"),
-        ("camera.txt", "16.5 12 14 15 7.5 5.5", "not in whole pixels"),
-        ("camera.txt", "nan 12 14 15 7.5 5.5", "not in whole pixels"),
-        ("camera.txt", "inf 12 14 15 7.5 5.5", "not in whole pixels"),
+        ("camera.txt", "16.5 12 14 15 7.5 5.5", "not a whole number of pixels"),
+        ("camera.txt", "nan 12 14 15 7.5 5.5", "not a whole number of pixels"),
+        ("camera.txt", "inf 12 14 15 7.5 5.5", "not a whole number of pixels"),
         ("camera.yaml", "{width: 16, height: 12, fx: 14, fy: 15, cx: 7.5}", "cy is missing"),
         ("camera.yaml", "{width: 16, height: 12, fx: 1, fy: 1, cx: 1, cy: 1, k: 2}", "unknown parameter 'k'"),
         ("camera.yaml", "{width: wide, height: 12, fx: 1, fy: 1, cx: 1, cy: 1}", "width must be of type int"),

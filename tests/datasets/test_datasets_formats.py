@@ -184,7 +184,7 @@ def test_the_remedy_mends_stamps_of_a_clock_that_are_as_large_as_those_of_1973(t
     """Nanoseconds from the 100th second on are taken for milliseconds since 1970."""
     folder = write_tum(tmp_path, Content(24), 100.0)
     rescaled(folder / "groundtruth.txt", 1e9)
-    said = refused(folder, "their unit is not the one that was taken", "(or stamp_us, stamp_ms)")
+    said = refused(folder, "their unit is not the one assumed", "(or stamp_us, stamp_ms)")
     (line,) = re.findall("'(# stamp_.*?)'", said)
     rescaled(folder / "groundtruth.txt", 1.0, line)
     assert len(open_dataset(folder)) == 24

@@ -142,7 +142,7 @@ def test_another_program_is_told_so() -> None:
     server = HTTPServer(("127.0.0.1", 0), Page)
     Thread(target=server.serve_forever, daemon=True).start()
     try:
-        with pytest.raises(DatasetError, match=r"no Foxglove server \(.*404"):
+        with pytest.raises(DatasetError, match=r"not a Foxglove server \(.*404"):
             FoxgloveClient(f"127.0.0.1:{server.server_port}")
     finally:
         server.shutdown()
@@ -154,7 +154,7 @@ def test_a_websocket_of_another_protocol_is_told_so() -> None:
 
     with serve(lambda connection: None, "127.0.0.1", 0) as server:
         Thread(target=server.serve_forever, daemon=True).start()
-        with pytest.raises(DatasetError, match=r"no Foxglove server"):
+        with pytest.raises(DatasetError, match=r"not a Foxglove server"):
             FoxgloveClient(f"127.0.0.1:{server.socket.getsockname()[1]}")
         server.shutdown()
 

@@ -379,7 +379,8 @@ def test_each_image_has_the_camera_of_its_time(make: Make) -> None:
     dataset = open_dataset(make(own_poses, send_zeros, write))
     assert dataset.camera == CAMERA
     assert [frame.camera for frame in dataset] == cameras
-    said = f"the camera changes {len(set(cameras)) - 1} times, by its CameraInfo: from frame 000002 on fx is "
+    changes = f"the camera changes {len(set(cameras)) - 1} times"
+    said = f"{changes}, according to its CameraInfo: from frame 000002 on fx is "
     assert f"{said}{OTHER.fx:g}, before {CAMERA.fx:g}" in dataset.notes
 
 

@@ -66,7 +66,7 @@ def test_info_of_a_bag_that_leaves_a_choice_suggests_all_of_them(tmp_path: Path)
         fill(bag, ("/vio/pose", "/slam/pose"))
     status, out, errors = said("info", tmp_path / "walk")
     assert (status, errors) == (2, "")  # map refuses it too
-    assert "It cannot be mapped like this" in out
+    assert "It cannot be mapped as it is" in out
     commands = [shlex.split(line) for line in out.splitlines() if line.startswith("taichi-mrf map")]
     sources = [command[2] for command in commands]
     assert sources == [f"{tmp_path / 'walk'}?pose={name}" for name in ("/slam/pose", "/vio/pose", "tf")]
@@ -99,7 +99,7 @@ def test_info_of_a_bag_does_not_suggest_what_it_refuses(tmp_path: Path) -> None:
         fill(bag, (), camera="rear")
     status, out, errors = said("info", tmp_path / "walk")
     assert (status, errors) == (2, "")
-    assert "It cannot be mapped like this" in out
+    assert "It cannot be mapped as it is" in out
     assert f"taichi-mrf map {tmp_path / 'walk'} --out" not in out
 
 

@@ -282,7 +282,7 @@ def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) 
 
 def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
     path = write_npz(tmp_path / "other.npz", {"values": np.zeros(3)})
-    refused(path, "contains values, and not depth_m, T_world_camera and K")
+    refused(path, "contains values, but not depth_m, T_world_camera and K")
     refused(tmp_path / "nowhere.npz", "no such folder or file")
     frames = write_npz(tmp_path / "frames.npz", {"depth_m": np.zeros((3, 4))})
     refused(f"{frames}?depth=/camera", "takes no options after a question mark")

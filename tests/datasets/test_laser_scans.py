@@ -284,7 +284,7 @@ def test_a_broken_range_in_an_npz_file_is_named_or_its_scan_left_out(
 def test_a_truncated_npz_file_is_named(tmp_path: Path, kept: int) -> None:
     path = write_npz(tmp_path / "cut.npz")
     path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(DatasetError, match=r"cut\.npz: not an npz file that is whole"):
+    with pytest.raises(DatasetError, match=r"cut\.npz: not a whole npz file"):
         open_scans(path)
 
 

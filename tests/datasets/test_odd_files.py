@@ -325,5 +325,7 @@ def test_a_bag_whose_rows_are_computed_is_refused(tmp_path: Path, made: str) -> 
         connection.execute("DROP TABLE IF EXISTS schema")
         connection.execute(f"CREATE {made}")
     connection.close()
-    with pytest.raises(DatasetError, match=r"walk: .*(schema is no table|other has columns that are comp)"):
+    with pytest.raises(
+        DatasetError, match=r"walk: .*(schema is not a table|other has columns that are comp)"
+    ):
         open_dataset(path)

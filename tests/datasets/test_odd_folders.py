@@ -213,7 +213,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "JSON": (jsons, "5 files such as frame_00000.json may hold.*--poses-are opengl"),
     "nerfstudio": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json.*--poses-are opengl"),
-    "depth as npy": (npy, "format that is not read (0.npy"),
+    "depth as npy": (npy, "unsupported format (0.npy"),
     "raw KITTI": (
         lambda f: (shutil.rmtree(f / "depth"), (f / "oxts").mkdir()),
         "raw recording of KITTI's, whose oxts/ holds latitudes",
@@ -224,7 +224,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "rtabmap-export": (
         lambda f: shutil.move(f / "depth", f / "rtabmap_depth"),
-        "what rtabmap-export has written; pass the database itself",
+        "is output of rtabmap-export; pass the database itself",
     ),
     "broken poses": (
         lambda f: (f / "poses.txt").write_text("1 2 3 4 5"),

@@ -86,7 +86,7 @@ def test_the_documented_plug_is_read_and_broken_ones_are_named(tmp_path: Path, r
     ]
     problems = [
         f"the plug 'gone' ({GROUP}) cannot be used: ModuleNotFoundError: No module named 'no_such_module'",
-        f"the plug 'no_format' ({GROUP}) cannot be used: TypeError: it names 3, which is no Format",
+        f"the plug 'no_format' ({GROUP}) cannot be used: TypeError: it names 3, which is not a Format",
     ]
     raised = f"the plug 'odd' ({GROUP}) cannot be used: ZeroDivisionError: division by zero"
     assert {*problems, raised} <= set(opened[2])

@@ -57,7 +57,7 @@ def test_velodyne(tmp_path: Path) -> None:
     np.column_stack([POINTS, np.ones(len(POINTS))]).astype("<f4").tofile(tmp_path / "0.bin")
     np.testing.assert_array_equal(read_cloud(tmp_path / "0.bin"), POINTS)
     (tmp_path / "1.bin").write_bytes(bytes(17))
-    with pytest.raises(DatasetError, match=r"1\.bin: has 17 bytes, which is no whole number of points"):
+    with pytest.raises(DatasetError, match=r"1\.bin: has 17 bytes, not a whole number of points"):
         read_cloud(tmp_path / "1.bin")
 
 

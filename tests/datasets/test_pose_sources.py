@@ -439,7 +439,7 @@ def test_what_a_bag_cannot_tell_is_refused(make: Make) -> None:
         ("?pose=/b", "topic /b: no message contains a pose"),
         ("?pose=tf", f"tf corrects nothing between odom and {FRAME}"),
         ("?pose=/a&body=wheel", "tf has no frame 'wheel'"),
-        ("?poses=x.txt", "does not go with --poses"),
+        ("?poses=x.txt", "does not work with --poses"),
         ("?pose=/camera/depth/image_raw", "is of type sensor_msgs/msg/Image"),
     ):
         with pytest.raises(DatasetError, match=words):

@@ -143,7 +143,7 @@ def test_where_time_jumps_back_poses_of_before_are_dropped(begin: Begin, tmp_pat
     np.testing.assert_array_equal(frame.depth_m, recorded.depth_m)
     assert frame.stamp >= first.stamp  # the map's time never goes back
     (said,) = [each for each in live.arrivals().news if "jumped back by 2.0 s" in each]
-    assert "poses of before are dropped, and mapping goes on" in said
+    assert "earlier poses are dropped, and mapping goes on" in said
 
 
 def test_stamps_of_another_clock_are_told_once_and_ages_count_from_arrival(begin: Begin) -> None:
@@ -336,7 +336,7 @@ def test_the_camera_of_a_distorted_lens_stays(begin: Begin) -> None:
     sender, live, _ = begin(zoomed, mounted, partial(odometry, numbers=BETWEEN), first=4)
     assert {frame.camera for frame in one_by_one(sender, live)} == {CAMERA}
     (said,) = [each for each in live.arrivals().news if "camera changes" in each]
-    assert "the lens is distorted: that of before is kept" in said
+    assert "the lens is distorted: the previous one is kept" in said
 
 
 def test_float_depth_in_millimetres_is_refused(begin: Begin) -> None:

@@ -310,7 +310,7 @@ def test_what_cannot_be_judged_is_refused(
 
 def test_a_tolerance_that_does_not_exist_is_refused(random_map: HandMade) -> None:
     m, depth = PoolMap(random_map.pool), np.ones(CAMERA.shape)
-    problem = "there is no tolerance '3sigma'; known are: voxel, 1.5sigma, 5cm, sensor"
+    problem = "there is no tolerance '3sigma'; choose from voxel, 1.5sigma, 5cm, sensor"
     with pytest.raises(ConfigError, match=problem):
         accuracy(m, depth, VIEWS[0], CAMERA, "3sigma")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=problem):

@@ -275,7 +275,7 @@ def test_triangles_without_area_and_outside_are_left_out() -> None:
 
 def test_wrong_input_is_one_clear_line() -> None:
     image = np.ones(CAMERA.shape, np.float32)
-    with pytest.raises(FrameError, match="1 clean depth images do not go with 2 poses"):
+    with pytest.raises(FrameError, match="1 clean depth images do not match 2 poses"):
         seen_voxels([image], VIEWS[:2], CAMERA, VOXEL)
     with pytest.raises(FrameError, match=r"\(3, 3\)"):
         seen_voxels([image[:3, :3]], VIEWS[:1], CAMERA, VOXEL)

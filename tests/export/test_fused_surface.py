@@ -118,7 +118,7 @@ def test_files_hold_it_by_default(tmp_path: Path) -> None:
 def test_frozen_keyframes_leave_the_marginals(tmp_path: Path) -> None:
     m = _map_of_plane(0.0)
     m.freeze_keyframe(0)
-    with pytest.raises(ConfigError, match="anew with --keep-surface"):
+    with pytest.raises(ConfigError, match="again with --keep-surface"):
         export_map(m, tmp_path / "plane.ply", ExportOptions(mesh=True, surface="rays"))
     export_map(m, tmp_path / "plane.ply", ExportOptions(mesh=True))
     assert b"std_m" not in (tmp_path / "plane.ply").read_bytes()[:1000]

@@ -107,7 +107,7 @@ def test_a_store_of_fixed_size_is_not_added_to(tmp_path: Path) -> None:
 
 
 def test_a_chunk_out_of_reach_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match="has no place"):
+    with pytest.raises(MapFileError, match="from the origin does not fit"):
         put(tmp_path / "map.zarr", {(1 << 17, 0, 0): 1})
 
 

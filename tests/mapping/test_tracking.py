@@ -91,7 +91,7 @@ def test_a_camera_that_is_back_where_it_started_is_found_again() -> None:
     order = [0, 1, 2, 3, 4, 5, 20, 20, 0, 1, 2, 3]
     result = map_sequence(walk(order), CONFIG)
     assert list(result.skipped) == ["walk-006", "walk-007", "walk-008", "walk-009"]
-    assert all("that the frames after it have to confirm" in result.skipped[f"walk-{i:03d}"] for i in (8, 9))
+    assert all("more frames must confirm" in result.skipped[f"walk-{i:03d}"] for i in (8, 9))
     assert result.track is not None
     assert result.track.found_again == {"walk-010": 4}
     assert errors(poses(result), order)[-2:, 1].max() < 0.03

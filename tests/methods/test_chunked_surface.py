@@ -124,9 +124,9 @@ def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
     assert not part.has_colors
     assert not part.colors(scene.probes()).any()
     for problem in (part.surface, lambda: export_map(part, tmp_path / "mesh.ply", RAYS)):
-        with pytest.raises(ConfigError, match=r"map the recording anew with --keep-surface, or export from"):
+        with pytest.raises(ConfigError, match=r"map the recording again with --keep-surface, or export from"):
             problem()
-    with pytest.raises(ConfigError, match="no measurements of rays: map the recording anew with"):
+    with pytest.raises(ConfigError, match="no measurements of rays: map the recording again with"):
         part.source.calibrated()
     with pytest.raises(ConfigError, match="map the recording with --color"):
         export_map(part, tmp_path / "mesh.ply", ExportOptions(color_by="photo"))

@@ -69,7 +69,7 @@ def test_poses_that_are_off_move_nothing() -> None:
 
 def test_layers_that_there_are_not() -> None:
     m = room_that_changed(ball_comes=True)
-    with pytest.raises(ConfigError, match="no layer 'moving'; known are static, dynamic, both"):
+    with pytest.raises(ConfigError, match="no layer 'moving'; choose from static, dynamic, both"):
         m.layer("moving")  # type: ignore[arg-type]
     with pytest.raises(ArgumentTypeError, match="stamp_s must be a number"):
         m.at("now")  # type: ignore[arg-type]
@@ -113,7 +113,7 @@ def test_maps_that_have_no_layers(saved: Path, tmp_path: Path) -> None:
         (tmp_path / "static.npz", ["--layer", "dynamic"], "mapped with --time.half-life-s"),
         (tmp_path / "log_odds.npz", ["--at", "3"], "need a map of mrf; .* is one of log_odds"),
         (tmp_path / "map.zarr", ["--layer", "static"], "has no keyframes"),
-        (saved, ["--at", "-1000"], "no keyframe of that time; they are from 0 to 23 s"),
+        (saved, ["--at", "-1000"], "no keyframe at that time; they are from 0 to 23 s"),
     ):
         with pytest.raises(ConfigError, match=problem):
             export(path, "--to", tmp_path / "out.ply", *flags)

@@ -315,7 +315,7 @@ def test_a_field_follows_another_map(hand: HandMap, edited: Edited) -> None:
     wanted = DistanceField(hand, MAX_M, "unknown").distance(points)
     np.testing.assert_array_equal(field.distance(points), wanted)
     assert field.update() == 0
-    with pytest.raises(ConfigError, match=r"voxels of 0\.05 m cannot follow a map of voxels of 0\.1 m"):
+    with pytest.raises(ConfigError, match=r"voxels of 0\.05 m cannot follow a map with voxels of 0\.1 m"):
         field.update(room_map("mrf"))
     np.testing.assert_array_equal(field.distance(points), wanted)
 
@@ -378,7 +378,7 @@ def test_what_cannot_be_worked_out(hand: HandMap, monkeypatch: pytest.MonkeyPatc
         field.clearance(np.zeros((2, 1, 3)), [0.4])
     with monkeypatch.context() as patch:
         patch.setattr("taichi_mrf.queries.distance_bricks._MOST_BRICKS", 10)
-        with pytest.raises(CapacityError, match=r"bricks of 8\^3 voxels are needed and the most is 10"):
+        with pytest.raises(CapacityError, match=r"bricks of 8\^3 voxels, but at most 10 are possible"):
             DistanceField(hand, MAX_M)
     monkeypatch.setattr(memory, "_allowance", memory._Allowance())
     monkeypatch.setattr(memory, "available_bytes", lambda: 10_000)

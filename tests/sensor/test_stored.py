@@ -208,7 +208,7 @@ def test_files_that_hold_no_noise_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"sensor\.bias_table: leave it out"):
         noise_from_config(named_by(tmp_path, STEREO, ", bias_table: bias.npy"), PINHOLE)
     write_npz(tmp_path / "noise.npz", stored_arrays(PINHOLE))
-    with pytest.raises(ConfigError, match=r"noise\.npz: holds a PinholeCamera, which is no noise model"):
+    with pytest.raises(ConfigError, match=r"noise\.npz: holds a PinholeCamera, not a noise model"):
         noise_from_config(SensorConfig(sigma_table=str(tmp_path / "noise.npz")), PINHOLE)
     write_npz(tmp_path / "noise.npz", stored_arrays(PolynomialNoise((0.1,))))
     with pytest.raises(ConfigError, match=r"noise\.npz: holds a PolynomialNoise, not a PatchNoise"):

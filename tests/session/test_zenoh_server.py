@@ -225,7 +225,7 @@ def test_what_cannot_be_reached_is_said_in_one_line(monkeypatch: pytest.MonkeyPa
         tm.publish(MRFMap(0.1), zenoh=nobody)
     for written in (f"zenoh:{nobody}?domain=x", "zenoh:?qos=1"):
         refused = taichi_mrf("live", "synthetic:room", "--publish", written)
-        assert_refused(refused, "is written foxglove, ")
+        assert_refused(refused, "must be foxglove, ")
     monkeypatch.setitem(sys.modules, "zenoh", None)
     with pytest.raises(ConfigError, match=r"taichi-mrf\[robot\]"):
         tm.publish(MRFMap(0.1), zenoh=nobody)

@@ -74,7 +74,7 @@ def test_without_a_compiler_the_error_says_what_to_install(
 
 
 def test_an_unknown_compiler_is_one_line_that_names_both() -> None:
-    said = f"unknown compiler 'numba' in {VARIABLE}; known are taichi, quadrants"
+    said = f"unknown compiler 'numba' in {VARIABLE}; use taichi, quadrants"
     info = "import taichi_mrf.cli.main as c, sys; sys.exit(c.main(['info']))"
     done = python("-c", info, **{VARIABLE: "numba"})
     assert done.returncode != 0

@@ -30,7 +30,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 def test_a_search_without_a_page_leaves_parameters_table_and_verdict(searched: tuple[Path, str]) -> None:
     out, said = searched
     assert {path.name for path in out.iterdir()} == {"best.yaml", "tries.csv"}
-    assert "6 frames of synthetic:room make the map, 2 score it, 1 are kept back" in said
+    assert "6 frames of synthetic:room make the map, 2 score it, 1 are held back" in said
     assert re.search(r"log-likelihood +[+-]\d\.\d{3} +[+-]\d\.\d{3}  [+-]\d\.\d{3}\n", said)
     assert len((out / "tries.csv").read_text().splitlines()) == 4
     assert config.load(out / "best.yaml").voxel_size == 0.1

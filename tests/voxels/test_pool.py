@@ -169,7 +169,7 @@ def test_more_voxels_than_an_array_can_have_is_an_error_and_not_an_attempt(
     pool = BrickPool(PRIOR)
     assert len(pool.allocate(some_bricks(390))) == 390
     assert len(pool.allocate(some_bricks(10, first=500))) == 10  # up to the last one
-    with refusal(CapacityError, f"{600 * VOXELS:.3g} voxels and the most is {400 * VOXELS:.3g}"):
+    with refusal(CapacityError, f"{600 * VOXELS:.3g} voxels, but at most {400 * VOXELS:.3g} are possible"):
         pool.allocate(some_bricks(200, first=900))
 
 

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf map`` shows of a run: its progress, its result, and the exit status that it ends with."""
+"""Output of ``taichi-mrf map``: the progress of a run, its result, and its exit status."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ from taichi_mrf.session.files import MAP_FILE, VOXEL_FILE
 from taichi_mrf.session.report import report_json
 
 OPEN_VOXELS = "Look at the .png files, or open voxels.ply in MeshLab, CloudCompare or Blender. "
-KEPT = "The files are kept; --force ends without this error."
+KEPT = "The files are kept; --force suppresses this error."
 LIVE_VIEW = "shows the map in the browser."
 
 
@@ -42,7 +42,7 @@ def print_finished(console: Terminal, options: Map, report: dict[str, Any]) -> N
     """Print that the folder holds this very run already."""
     if options.json:
         print(report_json(report), end="")
-    console.print_line(f"{options.out} holds this run already, finished; --overwrite maps it again.")
+    console.print_line(f"{options.out} already holds this run, finished; --overwrite maps it again.")
 
 
 def exit_status(options: Map, report: dict[str, Any], request: StopRequest) -> int:

@@ -54,7 +54,7 @@ MapOne = Callable[[MapTask, ProgressBar, StopRequest], tuple[dict[str, Any], lis
 """Maps one sequence into its folder, which exists; returns the report and the files."""
 
 _PATIENCE_S = 20.0
-"""How long to wait for the folder: the process that a lost worker has left may still hold it for a moment."""
+"""Longest wait for the folder: the process that a lost worker has left may still hold it for a moment."""
 
 
 @dataclass

@@ -76,7 +76,7 @@ class MapTask:
 
     @cached_property
     def mistakes(self) -> list[str]:
-        """What is odd in the recording, with the command that mends it: a look of seconds, once a run."""
+        """The oddities of the recording, with the command that fixes them; checked once, in seconds."""
         try:
             found = remedy(self.source, self.options.poses.file, self.options.reading)
         except DatasetError:  # such as a recording without poses

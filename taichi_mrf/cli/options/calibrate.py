@@ -63,7 +63,7 @@ class Calibrate:
     """Draw bias and sigma against depth and over the image, and the coverage."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[CalibrationConfig, tyro.conf.arg(name="")] = field(default_factory=CalibrationConfig)
     """Parameters."""

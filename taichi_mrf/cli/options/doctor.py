@@ -38,4 +38,4 @@ class Doctor:
     """Backend that renders a built-in source."""
 
     reading: Reading = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
+    """Options for reading SOURCE."""

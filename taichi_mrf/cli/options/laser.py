@@ -68,7 +68,7 @@ class Laser:
     """Print the report as JSON, and nothing else, on stdout."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[LaserConfig, tyro.conf.arg(name="")] = field(default_factory=LaserConfig)
     """Parameters."""

@@ -82,19 +82,19 @@ class Live:
     """Open the page in a browser on this machine."""
 
     reading: Reading = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
+    """Options for reading SOURCE."""
 
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
-    """How SOURCE's poses are used."""
+    """Use of SOURCE's poses."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
     """Source of sigma."""
 
     publishing: Annotated[PublishFlags, tyro.conf.arg(name="")] = field(default_factory=PublishFlags)
-    """Where the map is served to others."""
+    """Address at which the map is served to others."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=live_defaults)
     """Parameters."""

@@ -92,13 +92,13 @@ class Map:
     """Print the report as JSON, and nothing else, on stdout."""
 
     reading: Reading = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
+    """Options for reading SOURCE."""
 
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
-    """How SOURCE's poses are used."""
+    """Use of SOURCE's poses."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters."""
@@ -108,7 +108,7 @@ class Map:
         if self.sources is not tyro.MISSING and not self.sources:
             raise ConfigError("map needs a SOURCE: a recording, or a built-in one such as synthetic:room")
         if self.resume and self.overwrite:
-            raise ConfigError("--resume and --overwrite do not go together")
+            raise ConfigError("--resume and --overwrite cannot be combined")
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
         self.noise.refuse_with(

@@ -42,7 +42,7 @@ class Bench:
     if one is more than 10% larger."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters; the voxel size among them is not used."""
@@ -93,7 +93,7 @@ class Eval:
     parameter file, or the name of a shipped one such as kinect_one."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """Device that runs the kernels."""

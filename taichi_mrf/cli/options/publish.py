@@ -17,7 +17,7 @@ _FORM = "foxglove, foxglove:PORT, foxglove:HOST:PORT, zenoh, zenoh:tcp/HOST:PORT
 
 @dataclass(frozen=True)
 class PublishFlags:
-    """Where the map is served to others."""
+    """Address at which the map is served to others."""
 
     publish: Annotated[str | None, tyro.conf.arg(metavar="foxglove[:PORT]|zenoh[:tcp/HOST:PORT]")] = None
     """Serve the map to Foxglove and to robots while it grows: voxels, the camera's path, tf, an octree for
@@ -58,24 +58,24 @@ class PublishFlags:
         host = place.get("host", "localhost")
         if host not in LOOPBACK:
             print_line(
-                f"Warning: whoever can reach {host} can watch the map at {server.address}: no password."
+                f"Warning: anyone who can reach {host} can watch the map at {server.address}: no password."
             )
         who = "ROS 2 nodes" if "zenoh" in place else "Foxglove and robots"
         print_line(f"{who} get the map at {server.address}")
         return server
 
     def _place(self) -> dict[str, Any]:
-        """Where MessageServer serves."""
+        """Arguments of MessageServer that say where it serves."""
         assert self.publish is not None
         wire, _, rest = self.publish.partition(":")
         if wire == "zenoh":
             address, _, domain = rest.partition("?domain=")
             if not (domain or "0").isdecimal() or "?" in address:
-                raise ConfigError(f"--publish {self.publish}: is written {_FORM}")
+                raise ConfigError(f"--publish {self.publish}: must be {_FORM}")
             return {"zenoh": address, "domain": int(domain or 0)}
         host, _, port = rest.rpartition(":")
         if wire != "foxglove" or not (port.isdecimal() or self.publish == "foxglove"):
-            raise ConfigError(f"--publish {self.publish}: is written {_FORM}")
+            raise ConfigError(f"--publish {self.publish}: must be {_FORM}")
         if port and int(port) > 65535:
             raise ConfigError(f"--publish {self.publish}: the port must lie between 0 and 65535")
         return {"host": host.strip("[]") or "127.0.0.1", **({"port": int(port)} if port else {})}

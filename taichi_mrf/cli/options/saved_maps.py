@@ -91,7 +91,7 @@ class Info:
     """Print the facts as JSON instead of tables."""
 
     reading: Reading = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
+    """Options for reading SOURCE."""
 
 
 @dataclass(frozen=True)

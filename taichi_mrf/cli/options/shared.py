@@ -11,7 +11,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
 
 Reading = Annotated[SourceFlags, tyro.conf.arg(name=""), tyro.conf.UseAppendAction]
-"""How a command reads its source, as a field of its options."""
+"""A command's options for reading its source, as a field."""
 
 
 def check_least(options: object, **least: int) -> None:
@@ -30,7 +30,7 @@ def check_port(port: int) -> None:
 
 @dataclass(frozen=True)
 class Verbosity:
-    """How much is printed."""
+    """Amount of output."""
 
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print only problems, and JSON if requested."""
@@ -40,7 +40,7 @@ class Verbosity:
 
     def __post_init__(self) -> None:
         if self.quiet and self.verbose:
-            raise ConfigError("--quiet and --verbose do not go together")
+            raise ConfigError("--quiet and --verbose cannot be combined")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class NoiseFlags:
 
 @dataclass(frozen=True)
 class PoseFlags:
-    """How far recorded poses are trusted, or what takes their place."""
+    """Trust in recorded poses, or their replacement."""
 
     refine_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Align each new keyframe with the earlier ones, and all with each other at the end; the same as

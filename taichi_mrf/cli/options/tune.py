@@ -77,13 +77,13 @@ class Tune:
     """Open the page in a browser on this machine."""
 
     reading: Reading = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
+    """Options for reading SOURCE."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
     """Source of sigma."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
-    """How much is printed."""
+    """Amount of output."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters to begin with."""

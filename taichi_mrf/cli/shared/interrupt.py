@@ -18,7 +18,7 @@ from types import FrameType
 from taichi_mrf.errors import CutShortError
 
 INFER_SECONDS = 3.0
-"""How long after SIGTERM a map may still be inferred: containers kill after 10 s, and it has to be saved."""
+"""Time for inference after SIGTERM: containers kill after 10 s, and the map has yet to be saved."""
 
 _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 

@@ -1,4 +1,4 @@
-"""How far a command is: a bar on a terminal, elsewhere a line on stderr every few seconds.
+"""Progress of a command: a bar on a terminal, elsewhere a line on stderr every few seconds.
 
 Results go to stdout, everything about the work to stderr: `taichi-mrf map ... > result.txt` keeps its
 progress on the screen.

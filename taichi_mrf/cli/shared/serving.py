@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # options are parsed with this file, and need no NumPy
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 NICENESS = 10
-"""How much lower the priority of mapping is than that of the page."""
+"""Reduction of the priority of mapping below that of the page."""
 
 PrintLine = Callable[[str], None]
 
@@ -22,7 +22,7 @@ def warn_of_host(host: str, port: int, what_they_can: str, print_line: PrintLine
         return
     here = port or "PORT"  # 0 is any
     print_line(
-        f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
+        f"Warning: the page at --host {host} has no password: anyone who can reach this machine can "
         f"{what_they_can}. It is safer to omit --host and to tunnel from where you watch: "
         f"ssh -L {here}:127.0.0.1:{here} USER@THIS-MACHINE"
     )

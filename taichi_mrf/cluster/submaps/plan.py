@@ -1,10 +1,10 @@
-"""How a long sequence is cut into submaps: which space each owns, and which keyframes it needs.
+"""Division of a long sequence into submaps: the space that each owns, and the keyframes that it needs.
 
-The plane is cut into square columns, aligned to chunks of 64^3 voxels and without end in z. A submap owns
-the bricks in its column, its core, and has every keyframe with a ray in there, with all of its rays: all
+The plane is cut into square columns, aligned to chunks of 64^3 voxels and unbounded in z. A submap owns the
+bricks in its column, its core, and has every keyframe with a ray in there, with all of its rays: all
 messages to the core are computed in one place. The rest of those rays lies in the cores of other submaps.
 
-The common input of a run's tasks, the source, the parameters and the plan, is one JSON file of its folder.
+The common input of a run's tasks (source, parameters and plan) is one JSON file in its folder.
 """
 
 import json
@@ -84,7 +84,7 @@ class Plan:
 
     @property
     def overlap(self) -> float:
-        """How many submaps a keyframe belongs to on average."""
+        """Mean number of submaps that a keyframe belongs to."""
         distinct = {index for submap in self.submaps for index in submap.keyframes}
         return sum(len(submap.keyframes) for submap in self.submaps) / max(1, len(distinct))
 
@@ -95,7 +95,7 @@ def cells_of_chunks(chunks: NDArray[np.int32], chunks_across: int) -> NDArray[np
 
 
 def chunks_for(submap_size: float, voxel_size: float) -> int:
-    """How many chunks wide a column of at least ``submap_size`` metres is.
+    """Width in chunks of a column of at least ``submap_size`` metres.
 
     Raises ConfigError for a size that is not a positive number of metres.
     """
@@ -119,8 +119,8 @@ def plan_submaps(keyframes: Sequence[SeenFrame], submap_size: float, voxel_size:
 
 @dataclass(frozen=True)
 class SourceFrames:
-    """Which frames are mapped: what ``open_dataset`` is given, and every ``every``-th frame, ``limit`` of
-    them at most."""
+    """The frames to map: the arguments of ``open_dataset``, and every ``every``-th frame, at most ``limit``
+    of them."""
 
     source: str
     reading: dict[str, Any]

@@ -25,9 +25,9 @@ Halo = tuple[Bricks, LogOdds]
 
 @dataclass(frozen=True)
 class SubmapReport:
-    """How a task went. ``core_bricks`` belong to the submap; ``free_bricks`` do too, but have no voxels;
-    ``halo_bricks`` are those of other submaps whose evidence it was given; ``surface_bricks`` are those that
-    it owns in which keyframes have a say in the surface, if that is wanted. ``moved`` is the share of the
+    """Report on a task. ``core_bricks`` belong to the submap; ``free_bricks`` do too, but have no voxels;
+    ``halo_bricks`` are those of other submaps whose evidence it was given; ``surface_bricks`` are its own
+    bricks in which keyframes contribute to the surface, if a surface is wanted. ``moved`` is the share of the
     core's voxels whose probability has changed by more than 0.01 since the round before, and ``halo_moved``
     the same for the evidence sent to others; None in the first round."""
 
@@ -93,7 +93,7 @@ def write_round(path: Path, result: RoundResult) -> None:
 @contextmanager
 def _opened(path: Path) -> Iterator[NpzFile]:
     """The arrays by name, each read when it is asked for. Raises MapFileError."""
-    with open_npz(path, MapFileError, "a round of a submap that can be read") as file:
+    with open_npz(path, MapFileError, "a readable round of a submap") as file:
         yield file
 
 

@@ -116,11 +116,11 @@ def _check(config: Config, rounds: int) -> None:
     if not METHODS[config.method].has_messages:
         raise ConfigError(f"submaps need the method {methods_with('has_messages')}, not {config.method}")
     if config.poses.refine:
-        raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
+        raise ConfigError("poses.refine does not work with submaps: no task sees all keyframes")
     if config.volume.window_m > 0:
-        raise ConfigError("volume.window_m does not go with submaps: each task holds its part as a whole")
+        raise ConfigError("volume.window_m does not work with submaps: each task holds its part as a whole")
     if not config.time.is_static:
-        raise ConfigError("submaps are of a static world: time.half_life_s must be 0 with them")
+        raise ConfigError("submaps need a static world: time.half_life_s must be 0")
     if rounds < 0:
         raise ConfigError(f"--rounds must not be negative, not {rounds}")
 
@@ -143,7 +143,7 @@ def _job(
         if changed:
             raise ConfigError(
                 f"{folder / PLAN_FILE}: made with another {', '.join(changed)}; "
-                "--resume goes on with the same parameters"
+                "--resume needs the same parameters"
             )
         if job.config != config:  # in what makes no other map
             job = replace(job, config=config)

@@ -1,4 +1,4 @@
-"""Which frames become keyframes, and which chunks their rays cross: what the plan is made from."""
+"""Survey for the plan: the frames that become keyframes, and the chunks that their rays cross."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -91,7 +91,7 @@ def find_keyframes(
     """
     dataset = sequence.open()
     if dataset.endless:
-        raise DatasetError(f"{dataset.name}: has no end; submaps need a recording")
+        raise DatasetError(f"{dataset.name}: never ends; submaps need a recording")
     indices = range(0, len(dataset), sequence.every)[: sequence.limit]
     mapped = [i for number, i in enumerate(indices, 1) if not is_held_out(number, config.evaluation.hold_out)]
     blocks = [tuple(mapped[k : k + FRAMES_AT_ONCE]) for k in range(0, len(mapped), FRAMES_AT_ONCE)]

@@ -1,4 +1,4 @@
-"""Which usual mistake of conventions makes the frames of a recording contradict each other.
+"""Diagnosis of recordings whose frames contradict each other because of a usual mistake of conventions.
 
 Begin with ``diagnosis.py``: ``taichi-mrf doctor`` prints what its ``diagnose`` finds, and ``map`` refuses a
 recording by it. ``readings.py`` lists the mistakes, ``search.py`` tries them on pairs of frames.

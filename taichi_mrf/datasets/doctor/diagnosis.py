@@ -26,7 +26,7 @@ _AXES_WORDS = {
     "ned": "an aircraft's: x ahead, y right, z down",
 }
 _NO_READING = (
-    "how it is written: the frames that were looked at see different things, or contradict each other in a "
+    "how it is written: the frames examined see different things, or contradict each other in a "
     "way that none of the usual mistakes explains"
 )
 _CONTRADICTING = 2 * EXPLAINED
@@ -70,7 +70,7 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     recording and have not been undone in the dataset. Raises DatasetError if the source cannot be read, has
     no end, or no poses of its own."""
     if dataset.endless or dataset.tracked:
-        what = "never ends" if dataset.endless else "has no poses that are recorded"
+        what = "never ends" if dataset.endless else "has no recorded poses"
         raise DatasetError(
             f"{dataset.name}: {what}; doctor compares the frames of a recording by their poses"
         )
@@ -109,7 +109,7 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     stands = len(sample.poses) > 0 and np.allclose(sample.poses, sample.poses[0], rtol=0, atol=1e-6)
     if len(off) >= FEWEST_PAIRS and stands and off.mean() > _CONTRADICTING:
         text = f"the poses of {len(sample.poses)} frames are all the same, but what they see is not"
-        return Diagnosis((Finding(f"{text}: --poses FILE takes others"),), reading=given)
+        return Diagnosis((Finding(f"{text}: --poses FILE uses others"),), reading=given)
     carried = _carried(search, best)
     if best == given and before > _CONTRADICTING:
         return _cannot_tell(dataset, search, carried)
@@ -211,7 +211,7 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
         if best.lens:
             found.append(Finding(f"the intrinsics {best.lens}", flag))
         if best.focal != given.focal:
-            text = f"the focal length is {best.focal:.2f} times the one that is stated"
+            text = f"the focal length is {best.focal:.2f} times the stated one"
             found.append(Finding(text, flag))
         if best.camera is not None:
             found.append(Finding(_change(source, best.camera), flag))
@@ -219,7 +219,7 @@ def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> l
 
 
 def _change(source: Dataset, camera: PinholeCamera) -> str:
-    """Where the intrinsics of images first differ, in words, when what these show is of one ``camera``."""
+    """Sentence that names the first change of intrinsics, where the images show one ``camera`` throughout."""
     first, last = 0, len(source) - 1
     begins = pinhole(source.read(0).camera, "doctor")
     other = begins if begins != camera else pinhole(source.read(last).camera, "doctor")

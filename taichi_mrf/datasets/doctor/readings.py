@@ -71,14 +71,14 @@ class Reading(Conventions):
 
     @property
     def of_camera(self) -> "Reading":
-        """What of it is of the camera alone."""
+        """The part that concerns the camera alone."""
         return Reading(
             along_ray=self.along_ray, turned=self.turned, lens=self.lens, focal=self.focal, camera=self.camera
         )
 
     @property
     def of_poses_alone(self) -> "Reading":
-        """What of it is of poses, at their own times."""
+        """The part that concerns poses, at their own times."""
         return replace(
             self, late_s=0.0, along_ray=False, turned="", factor=1.0, lens="", focal=1.0, camera=None
         )

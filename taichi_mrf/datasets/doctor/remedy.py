@@ -16,18 +16,18 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 
 _ROUNDS = 3
-"""How often what is read with the flags that were found is looked at for further ones."""
+"""Rounds of diagnosis at most: each reads with the flags found so far, and looks for further ones."""
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """What is odd in a recording; ``command`` reads it as it was written, empty if nothing is known to."""
+    """The oddities of a recording; ``command`` reads it as it was written, empty if no command is known."""
 
     found: Diagnosis
     command: str = ""
 
     def in_words(self) -> str:
-        """What was found and what to do, in one line."""
+        """The findings and the remedy, in one line."""
         texts = "; ".join(each.text for each in self.found.findings)
         return f"{texts}: {self.command}" if self.command else texts
 

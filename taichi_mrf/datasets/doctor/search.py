@@ -118,7 +118,7 @@ class Search:
             yield T if T is None or not reading.turned else turn.T @ T @ turn
 
     def _differences(self, reading: Reading) -> Floats:
-        """What views of one camera see is projected at once: a search tries thousands of readings."""
+        """Points seen by views of one camera are projected at once: a search tries thousands of readings."""
         views, points = self.sample.views, self._points(reading)
         looks: dict[PinholeCamera | Sphere, list[tuple[int, int, Floats, View]]] = {}
         moves = zip(self.sample.pairs, self.moves(reading), strict=True)

@@ -25,7 +25,7 @@ PLACES = 5
 """Frames, evenly spread, that others are compared with."""
 
 APART = (1, 2, 6, 24)
-"""How many frames later the others were taken: one of them has moved far enough and still sees the same."""
+"""Steps in frames to the others: at one of them the camera has moved far enough and still sees the same."""
 
 REACH_S = 1.0
 """Poses this many seconds around the frames are read, to try poses that are late or early."""

@@ -29,7 +29,7 @@ from taichi_mrf.system.files import is_folder
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
-WANTED = "an npz file that can be read"
+WANTED = "a readable npz file"
 
 
 @dataclass(frozen=True)

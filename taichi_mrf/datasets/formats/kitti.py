@@ -221,7 +221,7 @@ def read_rig(path: Path, width: int, height: int) -> StereoRig:
             f"{path}: P0 is not the matrix of a pinhole camera without skew: fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0"
         )
     if np.abs(K - P_right[:, :3]).max() > _SAME * fx:
-        raise DatasetError(f"{path}: P0 and P1 differ in focal length or principal point: no rectified pair")
+        raise DatasetError(f"{path}: P0 and P1 differ in focal length or principal point: not rectified")
     if np.abs(P_left[:, 3]).max() > _SAME * fx or np.abs(P_right[1:, 3]).max() > _SAME * fx:
         raise DatasetError(f"{path}: P0 must be at the origin, and P1 moved along x alone")
     with naming(path, ConfigError):

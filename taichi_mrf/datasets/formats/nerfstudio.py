@@ -119,7 +119,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _file(folder: Path, where: str, name: Any) -> Path:
     """A file that a frame names, on whatever computer. Raises DatasetError."""
     if not isinstance(name, str) or len(name) > 4096 or "\0" in name:
-        raise DatasetError(f"{where}: a path is a text, not {str(name)[:40]}")
+        raise DatasetError(f"{where}: a path must be text, not {str(name)[:40]}")
     return beside(folder, name)
 
 
@@ -127,7 +127,7 @@ def _camera(where: str, values: Entry) -> PinholeCamera:
     """The camera of a frame's colour image."""
     model = str(values.get("camera_model", "OPENCV"))
     if model not in _MODELS:
-        raise DatasetError(f"{where}: camera_model {model[:40]} is not read; {', '.join(_MODELS)} are")
+        raise DatasetError(f"{where}: camera_model {model[:40]} is not supported; {', '.join(_MODELS)} are")
     w, h = (_positive(where, name, values.get(name)) for name in ("w", "h"))
     if "fl_x" in values:
         fl_x = _positive(where, "fl_x", values["fl_x"])
@@ -174,7 +174,7 @@ def _applied_scales(path: Path, values: Entry) -> tuple[float, float]:
     linear = _matrix(path, "applied_transform", applied)[:3, :3]
     factor = float(np.cbrt(np.linalg.det(linear)))
     if factor <= 0 or not np.allclose(linear.T @ linear, factor**2 * np.eye(3), atol=_RIGID * factor**2):
-        raise DatasetError(f"{path}: applied_transform is no rotation with a scale; the poses are deformed")
+        raise DatasetError(f"{path}: applied_transform is not a scaled rotation; the poses are deformed")
     return factor, scale
 
 
@@ -185,7 +185,7 @@ def _matrix(where: str | Path, name: str, found: Any) -> NDArray[np.float64]:
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise DatasetError(f"{where}: {name} is no 4 x 4 matrix of numbers")
+        raise DatasetError(f"{where}: {name} is not a 4 x 4 matrix of numbers")
     return np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
 
 

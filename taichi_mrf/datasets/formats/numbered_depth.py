@@ -156,7 +156,7 @@ def _poses_by_number(
                 "or give one pose for each"
             )
         ordered = sorted(poses, key=lambda pose: pose.key)
-        return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in their order"]
+        return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in order"]
     if trajectory.layout == "stamped":
         first_key, last_key = min(by_key), max(by_key)
         inside = [number for number in numbers if first_key <= number <= last_key]
@@ -184,8 +184,8 @@ def _frame(
 
 
 def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
-    """When an image was taken, in seconds: from its name if it tells, else from its number. Files of
-    matrices do not tell how many there are in a second."""
+    """Time of an image, in seconds: from its name if it tells, else from its number. Files of matrices do
+    not state their rate."""
     named = NUMBERED_IMAGE.fullmatch(path.name)
     if named is not None and named[3] is not None:
         return int(named[3][1:]) / 1e6

@@ -96,8 +96,8 @@ def unpacker() -> Any:
 
 
 def held_bytes(data: bytes) -> int:
-    """How many bytes the content of a file of depth or confidence has, unpacked. Raises DatasetError, which
-    names no file, for an LZFSE stream that is damaged."""
+    """Unpacked size, in bytes, of a file of depth or confidence. Raises DatasetError, which names no file,
+    for an LZFSE stream that is damaged."""
     if not is_packed(data):
         return len(data)
     place = total = 0
@@ -124,7 +124,7 @@ def unpacked(data: bytes, expected_bytes: int) -> bytes:
     try:
         content: bytes = lzfse.decompress(data)
     except Exception as error:
-        raise DatasetError("is damaged, it cannot be unpacked") from error
+        raise DatasetError("is damaged: it cannot be unpacked") from error
     if len(content) != expected_bytes:
         raise DatasetError(f"unpacks to {len(content):,} bytes, expected {expected_bytes:,}")
     return content
@@ -189,7 +189,7 @@ class Metadata:
             return [PinholeCamera(*size, *map(float, self.intrinsics[row])) for row in rows]
 
     def stamps(self, numbers: Sequence[int]) -> tuple[list[float], list[str]]:
-        """When each of these frames was taken, in seconds, and notes. Raises DatasetError."""
+        """Time of each of these frames, in seconds, and notes. Raises DatasetError."""
         times, rate = self.values.get("frameTimestamps"), self.values.get("fps")
         if times:
             try:
@@ -342,7 +342,7 @@ def open_recording(path: Path, options: ReadOptions) -> Record3D:
     count = len(metadata.poses)
     posed = [number for number in numbers if number < count] if metadata.has_poses else numbers
     if not posed:
-        raise DatasetError(f"{metadata.where}: has {count} poses, for none of its {len(numbers)} frames")
+        raise DatasetError(f"{metadata.where}: has {count} poses, but none for its {len(numbers)} frames")
     dropped = len(numbers) - len(posed)
     notes = (
         [f"{dropped} of {len(numbers)} images dropped: {METADATA} has no pose for them"] if dropped else []

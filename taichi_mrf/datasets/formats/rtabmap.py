@@ -147,7 +147,7 @@ class RtabmapDatabase:
         """The calibration of each node that has one and depth, as it is stored. Raises DatasetError."""
         query = "SELECT id, calibration FROM Data WHERE calibration IS NOT NULL AND length(depth) > 4"
         for id, blob in self._rows(f"{query} ORDER BY id"):
-            self._check(isinstance(blob, bytes), f"Data {id}: calibration is no blob")
+            self._check(isinstance(blob, bytes), f"Data {id}: calibration is not a blob")
             yield id, blob
 
     def images(self, id: int, color: bool) -> tuple[bytes, bytes | None]:
@@ -291,7 +291,7 @@ def _camera(
     PinholeCamera(max(width, 1), max(height, 1), fx, fy, cx, cy)
     if len(distortion) and (len(distortion) not in DISTORTION_COUNTS or not np.isfinite(distortion).all()):
         raise DatasetError(
-            f"the lens has {len(distortion)} coefficients, which fits no pinhole model of OpenCV"
+            f"the lens has {len(distortion)} coefficients, which no pinhole model of OpenCV has"
         )
     lens = tuple(map(float, distortion)) if distortion.any() else ()
     return NodeCamera((fx, fy, cx, cy), (max(width, 0), max(height, 0)), lens, T_body_camera)
@@ -448,7 +448,7 @@ def _posed_nodes(database: RtabmapDatabase, track: bool = False) -> tuple[list[P
         left_out = ", ".join(f"{session} ({nodes} nodes)" for session, nodes in others)
         notes.append(
             f"session {longest} ({count} nodes) is read, not {left_out}: each has an odometry of its own; "
-            "optimise them in RTAB-Map to have all"
+            "optimise them in RTAB-Map to use all"
         )
         without += len(found) - count
         found = [each for each in found if each.node.session == longest]

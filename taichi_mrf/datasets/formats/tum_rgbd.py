@@ -99,7 +99,7 @@ def _poses(folder: Path, may_lack: bool) -> Path:
     others = [] if is_file(folder / POSES) else [p for p in folder.glob("*.txt") if is_trajectory(p)]
     if is_file(folder / POSES) or len(others) == 1 or (may_lack and not others):
         return others[0] if others else folder / POSES
-    names = ", ".join(path.name for path in others) or "no other file of poses is there"
+    names = ", ".join(path.name for path in others) or "there is no other file of poses"
     raise DatasetError(
         f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses ({names}); {OTHERWISE}"
     )

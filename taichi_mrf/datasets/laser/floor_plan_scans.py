@@ -50,7 +50,7 @@ class Building:
     """(M, 3): x and y of the middle, radius."""
 
     def solid(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the points, (..., 2), lie in a solid."""
+        """True for points (..., 2) that lie in a solid."""
         inside = np.zeros(points.shape[:-1], dtype=bool)
         for x0, y0, x1, y1 in self.boxes:
             x, y = points[..., 0], points[..., 1]

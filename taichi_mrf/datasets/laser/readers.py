@@ -109,7 +109,7 @@ def _no_return_note(
 ) -> str:
     why = "set by --no-return-range"
     if given_m is None:
-        why = "found in the log, where so many beams have this range that it can be no surface"
+        why = "found in the log, where so many beams have this range that it cannot be a surface"
         if found_m is None:
             why = "assumed, since no range stands out in the log; --no-return-range sets another"
     return f"no return: ranges of {least_m:.2f} m and more, {(~hit).mean():.2%} of the beams ({why})"
@@ -257,7 +257,7 @@ def read_scan_npz(
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The file's arrays, of the right shapes."""
     arrays: dict[str, NDArray[Any]] = {}
-    with open_npz(path, DatasetError, "an npz file that is whole") as file:
+    with open_npz(path, DatasetError, "a whole npz file") as file:
         for name in ("range_m", "angle_rad", "pose_x_y_theta", "hit"):
             if name not in file:
                 held = ", ".join(file.names) or "nothing"
@@ -322,7 +322,7 @@ def holds_scans(path: Path) -> bool:
         return False
     try:
         if path.suffix == ".npz":
-            with open_npz(path, DatasetError, "an npz file that can be read") as arrays:
+            with open_npz(path, DatasetError, "a readable npz file") as arrays:
                 return "range_m" in arrays
         with open_regular(path, DatasetError) as file:
             head = file.read(_LOOKED_AT_BYTES) or b""  # None: a device without news

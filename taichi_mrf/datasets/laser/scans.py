@@ -61,7 +61,7 @@ class FloorPlan:
         return len(self.wall) - 1 - from_below, column
 
     def holds(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which of the pixels lie in the image."""
+        """True for pixels that lie in the image."""
         height, width = self.wall.shape
         return (row >= 0) & (row < height) & (column >= 0) & (column < width)
 

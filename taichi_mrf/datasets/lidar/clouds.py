@@ -173,7 +173,7 @@ def _dtype(path: Path, entries: dict[str, list[str]]) -> np.dtype:
 
 
 def _points(path: Path, entries: dict[str, list[str]]) -> int:
-    """How many points there are: POINTS, or WIDTH times HEIGHT, which must be the same."""
+    """Number of points: POINTS, or WIDTH times HEIGHT, which must be the same."""
     sizes = {
         name: _whole(path, name, entries[name][0])
         for name in ("WIDTH", "HEIGHT", "POINTS")
@@ -370,7 +370,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def _npz_points(path: Path) -> NDArray[np.float64]:
-    with open_npz(path, DatasetError, "an npz file that can be read") as file:
+    with open_npz(path, DatasetError, "a readable npz file") as file:
         name = _array_name(file)
         if name is None:
             held = ", ".join(file.names) or "nothing"
@@ -387,7 +387,7 @@ def _array_name(file: NpzFile) -> str | None:
 
 
 def layout_notes(clouds: Sequence[Path]) -> list[str]:
-    """How the first cloud that can be read was taken, where that is a guess that may be wrong."""
+    """Interpretation of the first readable cloud, where it is a guess that may be wrong."""
     for path in clouds:
         if path.suffix.lower() != ".bin":
             continue
@@ -404,7 +404,7 @@ def _float_table(path: Path) -> NDArray[np.float32]:
     fitting = [count for count in _COLUMNS if len(data) % (4 * count) == 0]
     if not fitting:
         raise DatasetError(
-            f"{path}: has {len(data)} bytes, which is no whole number of points of "
+            f"{path}: has {len(data)} bytes, not a whole number of points of "
             f"{', '.join(str(4 * count) for count in sorted(_COLUMNS))} bytes"
         )
     values = np.frombuffer(data, "<f4")
@@ -415,8 +415,8 @@ def _float_table(path: Path) -> NDArray[np.float32]:
 
 
 def _spread(table: NDArray[np.float32]) -> float:
-    """How much the numbers of a column differ: the mean logarithm of the variances. With a wrong number of
-    columns each is a mixture of x, y, z and the others, whose variances are larger."""
+    """Spread of the numbers in a column: the mean logarithm of the variances. With a wrong number of columns
+    each is a mixture of x, y, z and the others, whose variances are larger."""
     rows = table[np.isfinite(table).all(axis=1) & (np.abs(table) < 1e6).all(axis=1)].astype(np.float64)
     return float(np.log(rows.var(axis=0) + 1e-4).mean()) if len(rows) >= _LEAST_POINTS else 0.0
 

@@ -211,7 +211,7 @@ class OusterOptions:
     """The metadata of a .pcap, if it is not beside it."""
 
     sensor: int = 0
-    """Which sensor of a recording with several, from 0."""
+    """Index, from 0, of the sensor in a recording with several."""
 
     deskew: bool = True
     """Give each column of a scan the sensor's pose at its time."""

@@ -41,7 +41,7 @@ _MATRICES = ("T_world_lidar", "T_world_sensor", "T_world_camera")
 
 @dataclass(frozen=True)
 class ScanPose:
-    """When a scan was taken, in seconds, and from where; ``read`` gives T_world_sensor (4, 4), or raises
+    """Time of a scan, in seconds, and its pose; ``read`` gives T_world_sensor (4, 4), or raises
     KeyframeError."""
 
     stamp: float
@@ -125,7 +125,7 @@ def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
 
 
 def _from_npz(path: Path, clouds: Sequence[Path]) -> tuple[dict[Path, ScanPose], list[str]]:
-    with open_npz(path, DatasetError, "an npz file that can be read") as file:
+    with open_npz(path, DatasetError, "a readable npz file") as file:
         name = next((name for name in _MATRICES if name in file), None)
         if name is None:
             raise DatasetError(

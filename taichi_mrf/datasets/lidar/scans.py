@@ -53,7 +53,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Motion:
-    """When and where a lidar measured: the ``stamp`` of a scan in seconds, its pose then and at any time."""
+    """Time and place of a lidar: the ``stamp`` of a scan in seconds, its pose then and at any time."""
 
     stamp: float
     T_world_lidar: Pose
@@ -134,7 +134,7 @@ class _Order:
 
 
 def _in_time(seconds: NDArray[np.float64], known: NDArray[np.bool_]) -> _Order | None:
-    """How pixels measured at times (H, W) follow each other; None if they do not, column by column."""
+    """Order of pixels measured at times (H, W); None if they do not follow each other column by column."""
     height, width = seconds.shape
     apart = max(1, width // 8)  # times may be those of packets of columns
     steps = (seconds[:, apart:] - seconds[:, :-apart])[known[:, apart:] & known[:, :-apart]] / apart
@@ -251,8 +251,8 @@ def median_range(range_m: NDArray[np.floating]) -> float:
 
 
 def reach_of(range_m: NDArray[np.floating]) -> float:
-    """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
-    of metres, and at most MOST_REACH_M. Warns if most go further."""
+    """Reach of ranges, 0 for none: all but the thousandth of them that may be damaged, rounded up to tens of
+    metres, and at most MOST_REACH_M. Warns if most go further."""
     far_m = median_range(range_m)
     if far_m > MOST_REACH_M:
         warnings.warn(
@@ -305,7 +305,7 @@ class LidarScans(LidarRecording, Table[RecordedScan]):
 
 
 def measured_points(points_m: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points (..., 3) in the sensor's frame are measurements: not NaN, not infinite and not 0."""
+    """True for points (..., 3) in the sensor's frame that are measurements: not NaN, infinite or 0."""
     with np.errstate(over="ignore", invalid="ignore"):
         range_m = np.linalg.norm(points_m.astype(np.float64), axis=-1).astype(np.float32)
     return np.isfinite(range_m) & (range_m > 0)

@@ -31,8 +31,8 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import exists, is_folder
 
 FrameKey = str | int | float
-"""Which frame a pose is of: a frame's name (str), its number (int), or the time when it was taken, in seconds
-(float). A number is the one in the frames' names, or the frame's index from 0, whichever fits more poses."""
+"""Frame of a pose: the frame's name (str), its number (int), or its time in seconds (float). A number is the
+one in the frames' names, or the frame's index from 0, whichever fits more poses."""
 
 ChangedPoses = Mapping[FrameKey, ArrayLike]
 """Poses T_world_camera, (4, 4), by frame."""
@@ -48,7 +48,7 @@ class PoseSource(Protocol):
 
     @property
     def problem(self) -> str | None:
-        """Why the source cannot be read at present, if that has lasted for some time; None if it can be."""
+        """Reason why the source has been unreadable for some time; None if it can be read."""
         ...
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
@@ -124,7 +124,7 @@ class WatchedFile:
 
     @property
     def problem(self) -> str | None:
-        """Why the file cannot be read, once it has stayed so for STAYS_BROKEN_S seconds."""
+        """Reason why the file cannot be read, once it has been unreadable for STAYS_BROKEN_S seconds."""
         lasts = self._clock() - self._broken_since > STAYS_BROKEN_S
         return self._error if lasts else None
 

@@ -58,12 +58,12 @@ class FramePoses:
         self._timed = TimedPoses([], [])
         self._taken: ChangedPoses = {}
         self.changes = 0
-        """How often poses were taken in."""
+        """Number of times that poses were taken in."""
         self.unknown: list[str] = []
         """Names and numbers of the source that no frame has."""
 
     def __len__(self) -> int:
-        """How many poses the source has."""
+        """Number of poses that the source has."""
         return len(self._poses) + len(self._timed)
 
     @property

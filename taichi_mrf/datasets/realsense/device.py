@@ -171,8 +171,8 @@ STILL = "still"
 NO_IMU = "none"
 """In place of the camera's IMU: track without."""
 
-TRACKED = "the camera is tracked by its images; ?poses=FILE gives its poses, ?poses=still says that it stands"
-ENDLESS = "the camera never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
+TRACKED = "the camera is tracked by its images; ?poses=FILE gives its poses, ?poses=still if it stands"
+ENDLESS = "the stream never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def by_axes(
         return poses, []
     note = (
         f"poses of {depth.frame or 'the camera'} are taken for those of a body, x ahead and z up: "
-        f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
+        f"neighbouring images differ by {found[1][1.0]:.1%} that way, by {found[0][1.0]:.1%} as they are; "
         "?body=FRAME or ?optical=FRAME takes them as they are"
     )
     return turned, [note]
@@ -273,7 +273,7 @@ def summarise(path: Path) -> BagSummary:
 
 
 def summary_of(reader: TopicSource) -> BagSummary:
-    """What topics hold, and how to name them. Raises DatasetError, which names the source."""
+    """The contents of topics, and how to name them. Raises DatasetError, which names the source."""
     topics = list(reader.topics.values())
     if any(topic.name.startswith(REALSENSE) for topic in topics):
         return BagSummary(topics, {}, reader.duration, [], [f"realsense:{reader.path}?poses=FILE"], "")

@@ -51,7 +51,7 @@ class Beside:
         return None if entry is None else self.of(self.reader.read(self.topic, entry), depth_m, camera)
 
     def of(self, message: Any, depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[Any]:
-        """The same of a message of the topic."""
+        """Colours or sigmas from a message of the topic."""
         with naming(f"{self.reader.path}: topic {self.topic}"):
             return self.decode(message, depth_m, camera)
 
@@ -97,8 +97,8 @@ def is_beside(name: str, depth: str) -> bool:
 
 
 def _misfit(reader: TopicSource, name: str, camera: PinholeCamera) -> str | None:
-    """Why a topic's images cannot be the confidence of a camera's, None if they can. Raises DatasetError if
-    it holds no images."""
+    """Reason why a topic's images cannot be the confidence of a camera's, None if they can. Raises
+    DatasetError if it holds no images."""
     described(reader, name)
     try:
         height, width = messages.grey_image(reader.first(name)).shape
@@ -154,7 +154,7 @@ class BagImu:
 
 
 def imu_row(entry: Entry, message: Any) -> ImuRow:
-    """What a message of an IMU measures; accelerations are nan if it has none."""
+    """The measurement in an IMU message; accelerations are nan if it has none."""
     rate, force = message.angular_velocity, message.linear_acceleration
     felt = (force.x, force.y, force.z) if _measures(message, "linear_acceleration") else (np.nan,) * 3
     return (entry.stamp, rate.x, rate.y, rate.z, *felt)
@@ -182,7 +182,7 @@ def find_imu(sensor: BagSensor, wanted: str, first_s: float) -> tuple[BagImu | N
         return None, [f"imu: {name} is not used: tf has no fixed transform from {frame!r} to {optical!r}"]
     imu = BagImu(name, T_optical_imu, [found_rows[entry] for entry in sensor.run.of(list(found_rows))])
     up = upwards_at(imu.samples(imu.rows)[1], first_s)
-    level = "the first image is level by it" if up is not None else "which way is up it does not say"
+    level = "the first image is level by it" if up is not None else "it does not say which way is up"
     return imu, [f"imu: {name} measures turns; {level}"]
 
 

@@ -73,7 +73,7 @@ def decode(message: Any, stamp: float) -> Cloud:
 
 
 def _times(points: NDArray, stamp: float) -> NDArray[np.float64] | None:
-    """When points (H, W) were measured, in seconds from the header's stamp, if the message has that."""
+    """Times of points (H, W), in seconds from the header's stamp, if the message has them."""
     names = points.dtype.names or ()
     time = next((points[name] for name in TIMES if name in names), None)
     return None if time is None else _seconds(time, stamp)
@@ -130,7 +130,7 @@ _LEAST_MEASURED = 0.2
 """Share of pixels below which nothing is said of the others."""
 
 _NEIGHBOURS = 1.5
-"""How many columns nine tenths of the pixels may lie from where row and column say."""
+"""Largest distance, in columns, of nine tenths of the pixels from where row and column place them."""
 
 
 def organised(points_m: NDArray[np.floating]) -> tuple[Scan, NDArray[np.intp]] | None:
@@ -271,8 +271,8 @@ class LidarBag(LidarRecording, Table[BagRow]):
 
 @dataclass(frozen=True)
 class Clouds:
-    """How the point clouds of a ``topic`` of the source at ``path`` become frames. ``at`` gives the pose of
-    the lidar of a frame at a time in seconds, or None; if it is None itself, points are left where they are.
+    """Turns the point clouds of a ``topic`` of the source at ``path`` into frames. ``at`` gives the pose of a
+    frame's lidar at a time in seconds, or None; if it is None itself, points are left where they are.
     ``registered`` points are in the world's frame, and are taken back into the lidar's."""
 
     path: Path | str

@@ -1,4 +1,4 @@
-"""Which files and folders are bags, by their names."""
+"""Recognition of bags by the names of files and folders."""
 
 import re
 from pathlib import Path

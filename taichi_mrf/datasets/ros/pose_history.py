@@ -69,7 +69,7 @@ def open_history(path: Path, query: str) -> PoseHistory:
     ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, naming file and topic."""
     choice = parse_options(PoseChoice, query, str(path))
     if choice.poses:
-        raise DatasetError(f"{path}: ?poses= does not go with --poses; ?pose= names a topic, or tf")
+        raise DatasetError(f"{path}: ?poses= does not work with --poses; ?pose= names a topic, or tf")
     reader = RosReader(path)
     try:
         history = _open(reader, choice)

@@ -42,7 +42,7 @@ KEPT_S = 10.0
 
 @dataclass(frozen=True)
 class PoseChoice:
-    """How the poses are chosen; an empty text takes the bag's only candidate."""
+    """Choice of poses; an empty text takes the bag's only candidate."""
 
     pose: str = ""
     """The topic of poses, or tf."""
@@ -100,8 +100,8 @@ class BagPoses:
     def lacking(
         self, first: NDArray[np.float64], last: NDArray[np.float64], largest_gap: float
     ) -> NDArray[np.bool_]:
-        """Which spans of time, from ``first`` to ``last`` (N,) in seconds, meet one between two poses that is
-        longer than ``largest_gap``, or that is before all poses or after them."""
+        """True for spans of time, from ``first`` to ``last`` (N,) in seconds, that meet a gap between two
+        poses longer than ``largest_gap``, or that reach before all poses or after them."""
         moving = [each.stamps for each in self.moving if len(each) > 1 and not each.stands_still]
         found = np.zeros(len(first), bool)
         for stamps in moving or [np.asarray(self.stamps, np.float64)]:
@@ -330,15 +330,15 @@ def _read_poses(
         ]
         notes.append(
             f"{wrong.sum()} of {len(wrong)} messages of {name} have a stamp that is 0: their times of "
-            "recording are taken, less the usual delay, or they are left out where that is not known"
+            "recording are used, less the usual delay, or they are left out where that is not known"
         )
     if not found:
         raise DatasetError(f"{reader.path}: topic {name} contains no pose of the run; ?run=N chooses another")
     stamps, poses = [entry.stamp for entry, _ in found], [pose for _, pose in found]
     if alternates(stamps, poses):
         raise DatasetError(
-            f"{reader.path}: topic {name}: its poses jump to and fro, as of two publishers or robots: "
-            "?pose=TOPIC or ?poses=FILE takes others"
+            f"{reader.path}: topic {name}: its poses jump back and forth, as if from two publishers or "
+            "robots: ?pose=TOPIC or ?poses=FILE takes others"
         )
     return TimedPoses(stamps, poses), parent, child, notes
 

@@ -319,7 +319,7 @@ class RosReader(TopicSource):
 
 
 def _unreadable(problem: str) -> str:
-    """Why rosbags cannot open a file, and the remedy."""
+    """Reason why rosbags cannot open a file, and the remedy."""
     missing = re.search(r"files are missing: \[(.*)\]", problem)
     if missing:
         names = ", ".join(Path(each.strip("' ")).name for each in missing[1].split(","))
@@ -335,5 +335,5 @@ def _unreadable(problem: str) -> str:
         return f"{problem}; if you trust it, unpack it by 'rosbag decompress' or 'mcap decompress'"
     return (
         f"cannot be read as a bag, it is damaged or cut short: {problem}; 'rosbag reindex', 'ros2 bag "
-        "reindex' or 'mcap recover' may mend a recording that was not closed"
+        "reindex' or 'mcap recover' may repair a recording that was not closed"
     )

@@ -23,7 +23,7 @@ class BagRun:
     gaps: tuple[Gap, ...] = ()
 
     def part(self, stamps: Sequence[float], places: Sequence[int]) -> Sequence[int]:
-        """Which messages of a topic, or transforms of a frame, belong to the run, by their numbers."""
+        """Numbers of the messages of a topic, or transforms of a frame, that belong to the run."""
         if not self.gaps:
             return range(len(stamps))
         order = sorted(range(len(stamps)), key=places.__getitem__)
@@ -75,7 +75,7 @@ def choose_run(
     return (
         number,
         bounds,
-        [f"the clock starts again: of {words[number]} and {others}, the first named is read (?run=N)"],
+        [f"the clock restarts: of {words[number]} and {others}, the first is read (?run=N)"],
     )
 
 

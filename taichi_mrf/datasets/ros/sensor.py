@@ -28,7 +28,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 @dataclass(frozen=True)
 class SensorChoice(PoseChoice):
-    """How the messages of a sensor and their poses are chosen."""
+    """Choice of a sensor's messages and their poses."""
 
     depth: str = ""
     """The topic of depth images."""
@@ -130,7 +130,7 @@ def poses_of(sensor: BagSensor, choice: PoseChoice) -> dict[str, BagPoses]:
 
 def _several(reader: TopicSource, topic: str, what: str, frames: Mapping[str, int]) -> str:
     words = ", ".join(f"{frame or 'unnamed'} ({count})" for frame, count in frames.items())
-    return f"{reader.path}: topic {topic} has {what} of several frames, {words}, as of several sensors"
+    return f"{reader.path}: topic {topic} has {what} of several frames, {words}, as if from several sensors"
 
 
 Posed = list[tuple[int, Entry, Pose]]
@@ -169,8 +169,8 @@ def track_of(found: Mapping[str, BagPoses], options: ReadOptions) -> Callable[[]
 
 
 class DepthCamera(NamedTuple):
-    """What is mapped: a topic of depth images, its messages, the cameras that took them, and their poses by
-    the frames of the images."""
+    """The source of a map: a topic of depth images, its messages, the cameras that took them, and their
+    poses by the frames of the images."""
 
     depth: DepthTopic
     sensor: BagSensor
@@ -250,7 +250,7 @@ class BagCameras:
         for stated in (self.by_frame[frame] for frame, of in self.sent_by.items() if of == entry.frame):
             old = stated[-1][1]
             if distortion != self.distortion or (distortion and camera != old):
-                said = "and the lens is distorted: that of before is kept"
+                said = "and the lens is distorted: the previous one is kept"
             elif camera != old:
                 stated.append((since, camera))
                 said = f"fx is {camera.full.fx:g}, before {old.full.fx:g}"
@@ -372,7 +372,7 @@ def _frame_of_info(
     raise DatasetError(
         f"{reader.path}: the images of {depth.name} are of the frame {frame}, but the CameraInfo "
         f"of {name} is of {', '.join(dict.fromkeys(known))}, maybe another camera's; "
-        "pass --camera fx,fy,cx,cy" + ("" if several else f", or ?info={name} to take it all the same")
+        "pass --camera fx,fy,cx,cy" + ("" if several else f", or ?info={name} to use it anyway")
     )
 
 
@@ -388,7 +388,8 @@ def _changes(
     first = next((i for i, e in enumerate(entries) if e.stamp >= since and e.frame == frame), None)
     which = f"from frame {first:06d} on " if first is not None else ""
     return [
-        f"the camera changes {times}, by its CameraInfo: {which}fx is {new.full.fx:g}, before {old.full.fx:g}"
+        f"the camera changes {times}, according to its CameraInfo: {which}fx is {new.full.fx:g}, "
+        f"before {old.full.fx:g}"
     ]
 
 

@@ -67,11 +67,11 @@ def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], li
     if not entries:
         return [], []
     if len(entries) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in entries}) < len(entries):
-        said = f"the stamps of {topic} stand still: the times of recording are taken"
+        said = f"the stamps of {topic} do not change: the times of recording are used"
         return [replace(entry, stamp=entry.recorded_ns / NANOSECONDS) for entry in entries], [said]
     if sum(zero) > len(zero) - _LEAST and zero[0]:
         source, delay_s = _delay(reader, topic)
-        said = f"the stamps of {topic} are 0: the times of recording are taken, "
+        said = f"the stamps of {topic} are 0: the times of recording are used, "
         said += f"less the {delay_s:.3f} s of {source}" if source else "which are later"
         return [
             replace(entry, stamp=entry.recorded_ns / NANOSECONDS - delay_s) if unknown else entry
@@ -86,7 +86,7 @@ def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], li
         delays = [entry.recorded_ns / NANOSECONDS - entry.stamp for entry in right]
         notes = [
             f"{taken} of {len(entries)} {what} of {topic} have a stamp that is 0, repeated or far off: their "
-            f"times of recording are taken, less the usual {np.median(delays):.3f} s"
+            f"times of recording are used, less the usual {np.median(delays):.3f} s"
         ]
     if left_out.any():
         notes.append(
@@ -98,8 +98,8 @@ def stamped(reader: TopicSource, topic: str, what: str) -> tuple[list[Entry], li
 
 
 def _delay(reader: TopicSource, topic: str) -> tuple[str, float]:
-    """How much later than stamped messages are recorded, in seconds, and the topic that tells: CameraInfo
-    beside ``topic``, tf or poses; "" and 0 if none does."""
+    """The topic that tells the delay, CameraInfo beside ``topic``, tf or poses, and the delay from a stamp to
+    the recording of its message in seconds; "" and 0 if none does."""
     beside = topic.rpartition("/")[0]
     types = {messages.CAMERA_INFO: 0, **dict.fromkeys(messages.TF, 1), **dict.fromkeys(messages.POSES, 2)}
     others = [

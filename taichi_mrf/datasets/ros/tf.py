@@ -246,7 +246,7 @@ def tree_of(
         valid = [each for each in rows if np.isfinite(each.pose).all()]
         if not valid:
             problem = (
-                f"tf: the transform of {child} in {rows[0].parent} is none: not finite, or a quaternion of 0"
+                f"tf: the transform of {child} in {rows[0].parent} is not finite, or its quaternion is zero"
             )
             disputed[child] = Dispute(f"{problem}; ?poses=FILE takes poses of the sensor itself", {})
             continue
@@ -382,8 +382,8 @@ def _one_parent(parent: str, child: str, rows: Sequence[_Sent], last: bool) -> E
     if len(nodes) > 1:
         remedy = f"choose one with {' or '.join(f'?tf={node}' for node in nodes)}; {remedy}"
     return Dispute(
-        f"tf: transforms of {child} in {parent} contradict each other{_senders(rows)}, as of two robots or "
-        f"publishers: {remedy}",
+        f"tf: transforms of {child} in {parent} contradict each other{_senders(rows)}, as if from two "
+        f"robots or publishers: {remedy}",
         {},
     )
 
@@ -394,7 +394,7 @@ def _senders(rows: Iterable[_Sent]) -> str:
 
 
 def _steps(poses: np.ndarray, apart: int = 1) -> np.ndarray:
-    """How far each pose (N, 4, 4) is from a later one, in units of what counts as the same."""
+    """Distance of each pose (N, 4, 4) from a later one, in units of what counts as the same."""
     first, last = poses[:-apart], poses[apart:]
     metres = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
     cosine = (np.einsum("nij,nij->n", first[:, :3, :3], last[:, :3, :3]) - 1) / 2

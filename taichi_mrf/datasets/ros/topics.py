@@ -60,7 +60,7 @@ def no_depth(reader: TopicSource) -> str:
     text += f"; its topics: {', '.join(held) or 'none'}"
     maybe = [name for name, encoding in images.items() if messages.may_be_depth(encoding)]
     if maybe:
-        text += f". {' or '.join(f'?depth={name}' for name in maybe)} takes those images for depth"
+        text += f". {' or '.join(f'?depth={name}' for name in maybe)} reads those images as depth"
     if any(topic.type == LASER_SCAN for topic in reader.topics.values()):
         text += ". LaserScans are not read from bags; taichi-mrf laser reads CARMEN logs and .npz"
     if any(topic.type.endswith("/CustomMsg") for topic in reader.topics.values()):

@@ -52,7 +52,7 @@ _MODES = {
 
 @dataclass(frozen=True)
 class StereoMatching:
-    """How a rectified pair becomes a disparity image. Grey values are 0 to 255."""
+    """Matching of a rectified pair into a disparity image. Grey values are 0 to 255."""
 
     disparities: int = 128
     """Disparities from 0 up to below this many pixels are searched; a multiple of 16. What is nearer than
@@ -195,7 +195,7 @@ def stereo_disparity(
             f"the right one {right.shape[1]} x {right.shape[0]}"
         )
     if left.shape[1] < settings.block_size:
-        raise FrameError(f"a stereo pair of {left.shape[1]} columns is narrower than a block to be compared")
+        raise FrameError(f"a stereo pair of {left.shape[1]} columns is narrower than a matching block")
     disparity = _semi_global(left, right, settings)
     # Mirrored, the right image is a left one; its disparities come back mirrored.
     from_right = _semi_global(right[:, ::-1], left[:, ::-1], settings)[:, ::-1]
@@ -208,9 +208,9 @@ def stereo_disparity(
 def left_right_consistent(
     left_px: NDArray[np.floating], right_px: NDArray[np.floating], tolerance_px: float
 ) -> NDArray[np.bool_]:
-    """Which pixels of the left disparity image the right one confirms, (H, W); 0 = none in both. A pixel at
-    column u with disparity d is confirmed if column u - d (rounded) of the right image exists and has a
-    disparity within ``tolerance_px`` of d."""
+    """True for pixels of the left disparity image that the right one confirms, (H, W); 0 = none in both. A
+    pixel at column u with disparity d is confirmed if column u - d (rounded) of the right image exists and
+    has a disparity within ``tolerance_px`` of d."""
     rows, columns = np.indices(left_px.shape)
     partner = np.rint(columns - left_px).astype(np.int64)
     inside = (left_px > 0) & (partner >= 0)

@@ -73,7 +73,7 @@ class RigFile:
     """A file with a stamp in seconds a line."""
 
     matching: StereoMatching = field(default_factory=StereoMatching)
-    """How the pairs are matched."""
+    """Matching of the pairs."""
 
 
 def open_file(path: Path, options: ReadOptions) -> Dataset:

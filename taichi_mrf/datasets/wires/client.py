@@ -1,7 +1,6 @@
-"""What clients of robots share, whatever the wire: the messages that have come and wait to be taken.
+"""Common part of robot clients, whatever the wire: the queue of messages that wait to be taken.
 
-Of images, which come faster than they can be mapped, the oldest that nobody has taken is dropped for a new
-one.
+Images come faster than they can be mapped: the oldest that nobody has taken is dropped for a new one.
 """
 
 import threading

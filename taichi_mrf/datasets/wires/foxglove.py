@@ -188,7 +188,7 @@ def _channel(words: dict[str, Any]) -> Channel:
 
 def _another(why: str) -> str:
     return (
-        f"another program listens there, no Foxglove server ({why}): '{BRIDGE}' starts one, "
+        f"another program listens there, not a Foxglove server ({why}): '{BRIDGE}' starts one, "
         f"on port {PORT} (rosbridge, on 9090, speaks another protocol)"
     )
 
@@ -203,5 +203,5 @@ def _whole(address: str) -> str:
     except ValueError as error:
         raise DatasetError(f"foxglove:{address}: {said(error)}; an address is ws://HOST:{PORT}") from error
     if parts.scheme not in ("ws", "wss") or not host:
-        raise DatasetError(f"foxglove:{address}: is no address of a server: it is written ws://HOST:{PORT}")
+        raise DatasetError(f"foxglove:{address}: is not a server address: write ws://HOST:{PORT}")
     return text if port else f"{parts.scheme}://{parts.netloc.rstrip(':')}:{PORT}{parts.path}"

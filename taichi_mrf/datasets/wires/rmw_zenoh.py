@@ -96,9 +96,7 @@ class _Node:
             for name, value in settings.items():
                 config.insert_json5(name, json.dumps(value))
         except self._zenoh.ZError as error:
-            raise problem(
-                f"{self.source}: is no address of Zenoh's: it is written tcp/HOST:{PORT}"
-            ) from error
+            raise problem(f"{self.source}: is not a Zenoh address: write tcp/HOST:{PORT}") from error
         try:
             return self._zenoh.open(config)
         except self._zenoh.ZError as error:
@@ -182,7 +180,7 @@ class ZenohClient(_Node, Client):
                 self._subscribed[topic].append(self._declare(_SUBSCRIBER, publisher.described))
 
     def _nobody(self) -> str:
-        """Why there are no topics."""
+        """Reason why there are no topics."""
         info = self._session.info
         if not (self.address or info.routers_zid() or info.peers_zid()):
             return (
@@ -205,7 +203,7 @@ class ZenohClient(_Node, Client):
             else:
                 self._publishers.pop(token, None)
             self.channels = {each.channel.topic: each.channel for each in self._publishers.values()}
-        self.problem = "" if self.channels else f"{self.source}: nobody publishes any more; trying again"
+        self.problem = "" if self.channels else f"{self.source}: nobody is publishing any more; trying again"
 
     def _take_in(self, sample: Any) -> None:
         if sample.kind != self._zenoh.SampleKind.PUT:
@@ -270,7 +268,7 @@ class ZenohNode(_Node):
 
 
 def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
-    """What a liveliness token says of a publisher, or of another ``entity``; None if it is of none."""
+    """The publisher, or other ``entity``, that a liveliness token describes; None if it describes none."""
     parts = token.split("/")
     if len(parts) != 13 or parts[0] != _TOKEN or parts[5] != entity:
         return None
@@ -280,7 +278,7 @@ def publisher_of(token: str, entity: str = _PUBLISHER) -> Publisher | None:
 
 
 def published_ns(attached: bytes) -> int | None:
-    """When a message was published, in nanoseconds, by what is attached; None in another layout."""
+    """Time when a message was published, in nanoseconds, from its attachment; None in another layout."""
     if len(attached) != _ATTACHED.size:
         return None
     _, stamp_ns, count, _ = _ATTACHED.unpack(attached)

@@ -54,12 +54,12 @@ DECIDE_S = 3.0
 _LOOKED_AT = 4
 """Images whose numbers are looked at when a robot is opened."""
 
-ENDLESS = "a robot never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
+ENDLESS = "the stream never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
 @dataclass(frozen=True)
 class ZenohChoice(SensorChoice):
-    """What is chosen of a robot whose ROS 2 runs over Zenoh."""
+    """Choice of topics on a robot whose ROS 2 runs over Zenoh."""
 
     domain: int = 0
     """The robot's ROS_DOMAIN_ID."""
@@ -84,7 +84,7 @@ open_foxglove, open_zenoh = partial(_opened, FOXGLOVE), partial(_opened, ZENOH)
 
 
 def summarise(source: str) -> BagSummary:
-    """What a robot sends, from a few seconds of listening. Raises DatasetError."""
+    """Summary of a robot's messages, from a few seconds of listening. Raises DatasetError."""
     heard, _ = _connected(source)
     try:
         _listen(heard, _needed(heard, SensorChoice(), color=True))

@@ -26,8 +26,8 @@ _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 
 
 def decoder_of(channel: Channel) -> Callable[[bytes], Any]:
-    """What makes messages of ROS of a channel's bytes, of one of ROS_TYPES; for damaged data it raises errors
-    of many kinds, as this does for damaged descriptors, and TaichiMRFError without protobuf's library."""
+    """Decoder of a channel's bytes into ROS messages, of one of ROS_TYPES. It raises errors of many kinds for
+    damaged data; so does this for damaged descriptors, and TaichiMRFError without protobuf's library."""
     made = _MADE[channel.schema][1]
     if channel.encoding == JSON:
         return lambda data: made(json.loads(data))
@@ -36,9 +36,9 @@ def decoder_of(channel: Channel) -> Callable[[bytes], Any]:
 
 
 def protobuf_decoder(name: str, descriptors: bytes) -> Callable[[bytes], dict[str, Any]]:
-    """What finds the fields that were sent in the bytes of a message, whose type is ``name`` in a
-    FileDescriptorSet. It raises errors of many kinds for damaged data, and so does this for damaged
-    descriptors; ValueError if the type is not among them."""
+    """Decoder of a message's bytes into the fields that were sent; its type is ``name`` in a
+    FileDescriptorSet. It raises errors of many kinds for damaged data; so does this for damaged descriptors,
+    and ValueError if the type is not among them."""
     need = "messages in protobuf need", "ros"
     files = library("google.protobuf.descriptor_pb2", *need).FileDescriptorSet.FromString(descriptors).file
     types = library("google.protobuf.message_factory", *need).GetMessages(files)

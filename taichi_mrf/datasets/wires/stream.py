@@ -221,8 +221,8 @@ class Robot(Dataset):
         by = _in_words(latest - stamp)
         self._news.setdefault(
             "jump",
-            f"the robot's time has jumped back by {by}, as of a bag that is played again or a simulation "
-            "that starts again: the poses of before are dropped, and mapping goes on",
+            f"the robot's time has jumped back by {by}, as when a bag is replayed or a simulation "
+            "restarts: earlier poses are dropped, and mapping goes on",
         )
 
     def _whole(self, image: Posed) -> Posed | None:
@@ -310,7 +310,7 @@ class CameraRobot(Robot):
             since, said = self.mapped.cameras.hear(heard.entry, heard.message)
             first = [each.number for each in self._waiting if each.heard.entry.stamp >= since] or [self._came]
             if said:
-                told = f"the camera changes, by its CameraInfo: from frame {first[0]:06d} on {said}"
+                told = f"the camera changes, according to its CameraInfo: from frame {first[0]:06d} on {said}"
                 self._news.setdefault("camera", f"{told}; later changes are taken, too")
 
     def forget_after(self, stamp: float) -> None:
@@ -331,7 +331,7 @@ class LidarRobot(Robot, LidarRecording):
         return self.clouds.frame(posed.heard.entry, posed.heard.message, posed.pose, stamp, name)
 
     def until(self, entry: Entry, message: Any) -> float:
-        """When its last point was measured."""
+        """Time of its last point."""
         return self.clouds.until(entry, message)
 
     def is_posed(self, heard: Heard, pose: Pose) -> bool | None:

@@ -1,4 +1,4 @@
-"""Who is judged: each mapping method, and every reading of its maps that gives it a fair chance."""
+"""The contenders: each mapping method, and every reading of its maps that gives it a fair chance."""
 
 import hashlib
 from collections.abc import Callable, Sequence

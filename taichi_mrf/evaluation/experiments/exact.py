@@ -44,7 +44,7 @@ CERTAIN = 20.0
 """Log-odds of a label, where a method gives nothing but labels; float32 has no probability nearer to 1."""
 
 PASSED_ON: dict[str, Any] = {"schedule": "parallel", "damping": 0.5, "tolerance": 0.01, "iterations": 100}
-"""How messages are passed where each ray keeps its own."""
+"""Message passing where each ray keeps its own messages."""
 
 PER_RAY: dict[str, LaserConfig] = {
     "each ray, sum-product": LaserConfig(method="bp", polish=0, **PASSED_ON),
@@ -198,7 +198,7 @@ def _difference(
     reference: NDArray[np.float32],
     crossed: NDArray[np.bool_],
 ) -> dict[str, float]:
-    """How marginals and labels differ from the reference over the voxels that any ray crosses."""
+    """Differences of marginals and labels from the reference over the voxels that any ray crosses."""
     labels, wanted = marginals > 0.5, reference > 0.5
     apart = np.abs(marginals - reference)[crossed]
     either = (labels | wanted)[crossed].sum()

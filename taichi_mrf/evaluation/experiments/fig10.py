@@ -33,7 +33,7 @@ COLORS = {"all keyframes": "tab:blue", "new keyframe": "tab:green", "OctoMap": "
 def run_fig10(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """Seconds for each image. Raises ConfigError if OctoMap's binding is not installed."""
     if not octomap_available():
-        raise ConfigError("fig10 compares with OctoMap: pip install 'taichi-mrf[bench]' brings it")
+        raise ConfigError("fig10 compares with OctoMap: pip install 'taichi-mrf[bench]' adds it")
     scene = house_scene(experiment.data)
     count = min(KEYFRAMES, len(scene.views), experiment.limit or KEYFRAMES)
     timings = {}

@@ -18,7 +18,7 @@ Report = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Experiment:
-    """How an experiment is run."""
+    """Settings of an experiment."""
 
     data: Path
     """Folder with the scenes."""

@@ -29,7 +29,7 @@ uses 1.0 in a larger room and 0.5 in a small one; this camera turns round in a c
 would leave 5 keyframes that do not see all of the room."""
 
 PAPERS_THRESHOLD = 1.0
-"""The same for a folder that the user gives, as the paper's own room."""
+"""The threshold for a folder that the user gives, as in the paper's larger room."""
 
 MORE_LIKELY_THAN_NOT = float(np.nextafter(np.float32(0.5), np.float32(1)))
 """Just above 0.5, the probability of unknown voxels in recursive maps."""

@@ -31,8 +31,8 @@ from taichi_mrf.system.types import (
 from taichi_mrf.voxels.traversal import FAR
 
 _OVERLAP = 1e-5
-"""How much larger the cubes are taken, relative to their size: rounding would let rays that run along
-a common face slip between its neighbours."""
+"""Relative enlargement of the cubes: without it, rounding would let rays along a common face slip
+between neighbours."""
 
 _NEAR_M = 0.01
 """Triangles that reach nearer than this are left out."""
@@ -270,7 +270,7 @@ _AMBIENT = 0.62
 """Brightness of a face that the light does not reach, relative to one that it meets squarely."""
 
 _OCCLUSION = 0.55
-"""How much of the light a deep hollow loses."""
+"""Share of the light that a deep hollow loses."""
 
 
 def shaded(
@@ -341,7 +341,7 @@ def _light(
 
 
 def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How far each pixel lies behind its surroundings, (H, W), 0 to 1: a cheap ambient occlusion.
+    """Depth of each pixel behind its surroundings, (H, W), 0 to 1: a cheap ambient occlusion.
 
     The depth buffer's unsharp mask (Luft, Colditz and Deussen, SIGGRAPH 2006) at two scales.
     """

@@ -1,4 +1,4 @@
-"""Which way the map's surfaces face, and which way is up: what a picture needs beyond the voxels.
+"""Orientation of the map's surfaces, and the up direction: what a picture needs beyond the voxels.
 
 A map holds neither the direction of gravity nor the inside of a room. Both follow from what the keyframes
 see: a surface faces the camera that saw it, and most of a room is level or upright.

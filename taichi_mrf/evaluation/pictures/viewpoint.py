@@ -32,7 +32,7 @@ _CANDIDATE_CELLS = 30_000
 def faces_viewer(
     centres: NDArray[np.floating], normals: NDArray[np.floating], eye: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
-    """Which voxels (N, 3) show the side that was seen to a viewer at ``eye`` (3,) in metres.
+    """True for voxels (N, 3) whose observed side faces a viewer at ``eye`` (3,) in metres.
 
     Without the others a room looks like a doll's house: the near walls and the ceiling, of which a
     viewer outside would see the back, are gone. A voxel without a normal (0) is kept.

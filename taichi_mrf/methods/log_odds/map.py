@@ -302,7 +302,7 @@ class LogOddsMap(RecursiveMap[RayFootprint]):
     ) -> None:
         """``parameters`` are fields of LogOddsConfig, such as ``hit=0.7`` or ``max_range=4.0``.
 
-        ``noise`` (a Kinect 1 by default) is only asked for the bias, with ``correct_bias=True``.
+        ``noise`` (a Kinect 1 by default) supplies only the bias, with ``correct_bias=True``.
         Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(log_odds, LogOddsConfig, parameters, "log_odds", "LogOddsMap")

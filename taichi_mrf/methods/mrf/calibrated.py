@@ -1,4 +1,4 @@
-"""How likely each voxel holds a surface, from where the rays of all keyframes together place it.
+"""Probability that each voxel holds a surface, from where the rays of all keyframes together place it.
 
 A marginal is cautious: a keyframe's message is the average of its rays, and counts once, however many they
 are. Here each voxel gets its distance from the surface that all rays measured. With their mean signed

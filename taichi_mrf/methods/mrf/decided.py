@@ -80,7 +80,7 @@ class Decisions:
         thin_matter.call_matter(self._votes, log_odds, pool.bricks, pool.in_use, sweeper.voxel_size, *known)
 
     def calls(self, settled: bool) -> NDArray[np.uint8]:
-        """What rays say of voxels beyond the marginals, (slots, 512) (voxels/calls.py)."""
+        """The verdict of the rays on voxels beyond the marginals, (slots, 512) (voxels/calls.py)."""
         log_odds, pool = self.log_odds(settled), self._registry.pool
         self.call_matter(log_odds)
         known = pool.prior_log_odds, self._sweeper.volume.min_evidence

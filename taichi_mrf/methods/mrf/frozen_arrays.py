@@ -50,7 +50,7 @@ class WaitingMessages:
 
 
 def waiting_of(beliefs: DatedBelief) -> list[WaitingMessages]:
-    """What of a map waits, as far as its bricks are still there."""
+    """The waiting messages of a map whose bricks still exist."""
     found = []
     for each in beliefs.waiting():
         rows = np.flatnonzero(
@@ -108,7 +108,7 @@ def share_arrays(shares: Mapping[str, VoxelShare]) -> dict[str, NDArray]:
 
 
 def read_shares(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> dict[str, VoxelShare]:
-    """What frozen keyframes gave to each layer that pixels feed, from a file with bricks (n, 3). Raises
+    """The frozen keyframes' shares in each layer that pixels feed, from a file with bricks (n, 3). Raises
     MapFileError if it names others."""
     return {name: _read_share(path, file, bricks, made) for name, made in pixel_layers().items()}
 

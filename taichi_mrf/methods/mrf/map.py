@@ -1,7 +1,7 @@
 """MRFMap (Shankar & Michael, RSS 2020): keyframes in, marginal probabilities of occupancy out.
 
-The computation itself is inference/sum_product.py. This class names what a map can do; it is composed of
-parts (parts.py), and of functions that work on them, whose modules are loaded when they are first used.
+The computation itself is in inference/sum_product.py. This class is the map's interface; it is composed of
+parts (parts.py), and of functions that work on them, whose modules are loaded on first use.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -58,7 +58,7 @@ DOUBT_FREE = 0.01
 noise are never quite right. By default that is 0.02 surfaces per metre."""
 
 DOUBT_OCCUPIED = 0.01
-"""Chance that a predicted ray passes a voxel that was seen to be occupied, however often."""
+"""Chance that a predicted ray passes an occupied voxel, however often it was observed."""
 
 
 class MRFMap(BrickMap):
@@ -109,12 +109,12 @@ class MRFMap(BrickMap):
 
     @property
     def stale(self) -> bool:
-        """Always False: changes show at once."""
+        """Always False: changes take effect at once."""
         return False
 
     @property
     def settled(self) -> bool:
-        """True after a complete :meth:`infer` with the configured sweeps, until a keyframe changes."""
+        """True from a complete :meth:`infer` with the configured sweeps until a keyframe changes."""
         return self._parts.settled
 
     @property
@@ -138,7 +138,7 @@ class MRFMap(BrickMap):
         self._parts.settled = False
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove a keyframe, its messages, and the bricks that no other owns. Raises KeyframeError."""
+        """Remove a keyframe, its messages, and the bricks that no other one owns. Raises KeyframeError."""
         keyframe = self._parts.find(id)
         inferring.restore_messages(self._parts)
         self._parts.allocator.take_out(keyframe)
@@ -167,9 +167,9 @@ class MRFMap(BrickMap):
         (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
 
         1. Keyframes whose view moves by more than half a voxel are withdrawn: their messages belong to wrong
-           places and no longer count.
-        2. One by one, all are moved and swept at their new poses. The next is always the one whose viewpoint
-           is furthest from those already in place, so that a few soon cover the map.
+        places and no longer count.
+        2. One by one, all are moved and swept at their new poses. The next one is always that whose viewpoint
+        is furthest from those already in place, so that a few soon cover the map.
         3. Stale keyframes are swept again, as by :meth:`renew`; ``tolerance`` is passed to it.
 
         A keyframe stays where it is if nothing in its view would move by more than ``least`` voxels, unless
@@ -205,18 +205,18 @@ class MRFMap(BrickMap):
     def refine_pose(
         self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
     ) -> "posed.RefinedPose":
-        """Move a keyframe to the nearby pose at which its depth is most likely in the map of the others. The
-        search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
+        """Move a keyframe to the nearby pose at which its depth is most likely given the map of the others.
+        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
         return posed.refine_pose(self._parts, id, config, guesses)
 
     def depth_log_likelihood(self, id: int) -> float:
-        """Mean log-likelihood, per metre, of a keyframe's depth in the map of all others; NaN if it has
+        """Mean log-likelihood, per metre, of a keyframe's depth given the map of all others; NaN if it has
         none. Raises KeyframeError."""
         return posed.depth_log_likelihood(self._parts, id)
 
     @cached_property
     def aligner(self) -> "posed.Aligner":
-        """Aligns the keyframes with the surface that they have measured."""
+        """Aligner of the keyframes with their measured surface."""
         return posed.aligner_of(self._parts)
 
     def freeze_keyframe(self, id: int) -> None:
@@ -272,17 +272,17 @@ class MRFMap(BrickMap):
         return inferring.infer_steps(self._parts, sweeps, tolerance, keyframes)
 
     def checkpoint(self) -> inferring.Checkpoint:
-        """State that :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
+        """State from which :meth:`restore` undoes a full :meth:`infer` stopped by ``progress``."""
         return inferring.take_checkpoint(self._parts)
 
     def restore(self, checkpoint: inferring.Checkpoint) -> None:
-        """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
+        """Return to a checkpoint. Only :meth:`infer` may have been called since."""
         inferring.go_back(self._parts, checkpoint)
 
     def showing(self, checkpoint: inferring.Checkpoint) -> AbstractContextManager[None]:
-        """Within the block, all queries and files show the map at a checkpoint, as it was at rest: its
-        states, ray casts, layers, surface and colours. The block must not change the map. Since the
-        checkpoint only :meth:`infer_steps` may have been begun."""
+        """Within the block, all queries and files show the map as it was at a checkpoint: its states, ray
+        casts, layers, surface and colours. The block must not change the map. Only :meth:`infer_steps` may
+        have been started since the checkpoint."""
         return inferring.showing(self._parts, checkpoint)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> "depth_graph.FactorGraph":
@@ -312,9 +312,8 @@ class MRFMap(BrickMap):
         return count_observations(slots, sent, self._pool)
 
     def votes_at(self, point: ArrayLike) -> dict[int, float]:
-        """The vote of each keyframe on the voxel at a point (3,) in metres, by id: the log-odds that it adds
-        to those of the others, above 0 for occupied. Frozen keyframes and those without evidence are left
-        out."""
+        """Each keyframe's vote on the voxel at a point (3,) in metres, by id: the log-odds that it adds to
+        the others', above 0 for occupied. Frozen keyframes and those without evidence are left out."""
         inferring.restore_messages(self._parts)
         slots, numbers = self._registry.places_of(np.reshape(point, (1, 3)))
         sent = [(id, k.visible, k.messages) for id, k in self._keyframes.items() if k.messages is not None]
@@ -343,13 +342,13 @@ class MRFMap(BrickMap):
 
     @property
     def has_surface(self) -> bool:
-        """True if the surface of all keyframes can be made: none is frozen, or their measurements are kept
-        (``keep_surface``)."""
+        """True if the surface can be made from all keyframes: none is frozen, or the measurements of frozen
+        ones are kept (``keep_surface``)."""
         return self._parts.has_surface
 
     def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
-        """The signed distances that the keyframes measured, as of the last :meth:`infer`: computed once a
-        state of the map, read-only. ``between`` is called after each keyframe. Raises CapacityError."""
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`, read-only: computed
+        once for each state of the map. ``between`` is called after each keyframe. Raises CapacityError."""
         return surfacing.surface_field(self._parts, between)
 
     def surface(self, between: Callable[[], object] = lambda: None) -> "surfacing.FusedSurface":
@@ -357,7 +356,7 @@ class MRFMap(BrickMap):
         distances: vertices, triangles, normals, and for each vertex a standard deviation in metres, and its
         colour if keyframes have colour images.
 
-        It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
+        It is made from the keyframes' images and the current marginals, so call :meth:`infer` first.
         Frozen keyframes have no images, and count only with ``keep_surface``. ``between`` is called many
         times a second; an exception from it ends the work. Raises ConfigError for a map without keyframes,
         CapacityError if there is not enough memory.
@@ -387,8 +386,8 @@ class MRFMap(BrickMap):
 
     @property
     def dynamic(self) -> "reading.MapReading":
-        """The dynamic layer: voxels that are occupied now, but free by all keyframes together, without a
-        surface near. All others are unknown. Raises ConfigError in a map of a static world."""
+        """The dynamic layer: voxels that are occupied now, but free according to all keyframes together, with
+        no surface nearby. All others are unknown. Raises ConfigError in a map of a static world."""
         return self.layer("dynamic")
 
     def layer(self, which: "reading.Layer" = "both", stamp_s: float | None = None) -> "reading.MapReading":
@@ -413,7 +412,7 @@ class MRFMap(BrickMap):
         return self.decide()
 
     def decide(self, between: Callable[[], object] = lambda: None) -> "reading.MapReading":
-        """Compute :attr:`decided`, with ``between`` as :meth:`surface`. Raises CapacityError."""
+        """Compute :attr:`decided`, with ``between`` as in :meth:`surface`. Raises CapacityError."""
         return reading.decide(self, self._parts, between)
 
     @property
@@ -428,11 +427,11 @@ class MRFMap(BrickMap):
         return reading.calibrated(self, self._parts, between)
 
     def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
-        """Those by which voxels have their states where distances are at hand, else the marginals."""
+        """The calibrated log-odds where distances are available, else the marginals."""
         return self.decided._grid() if self.has_surface else self._grid()
 
     def first_surfaces(self) -> NDArray[np.uint8]:
-        """What rays say of the voxels of ``view.pool`` beyond marginals, (slots, 512) (voxels/calls.py)."""
+        """The rays' verdict on voxels of ``view.pool`` beyond marginals, (slots, 512) (voxels/calls.py)."""
         return self._parts.decisions.calls(self.settled)
 
     def changes(self, since_s: float) -> "change.MapChange":

@@ -33,9 +33,9 @@ from taichi_mrf.voxels.topology import Topology
 
 @dataclass(frozen=True)
 class RaysThen:
-    """Which rays surface and colours of a reading are made of: those of the keyframes up to ``stamp_s`` (all
-    if None), judged by the log-odds ``belief`` (capacity * 512). Where the reading has no voxel of the
-    probability ``least``, there is no surface; ``with_frozen`` tells whether frozen keyframes count."""
+    """The rays that make a reading's surface and colours: those of the keyframes up to ``stamp_s`` (all if
+    None), judged by the log-odds ``belief`` (capacity * 512). Where the reading has no voxel of the
+    probability ``least``, there is no surface; frozen keyframes count if ``with_frozen``."""
 
     belief: "ti.Ndarray"
     stamp_s: float | None

@@ -1,9 +1,9 @@
-"""What frozen keyframes have left in a map, moved into another: their evidence, read between its voxels.
+"""Evidence of frozen keyframes, moved from one map into another by interpolation between its voxels.
 
 Their images are gone, so nothing can be inferred anew. The evidence of a voxel is log-odds, a sum over
-keyframes, and more is added to it: what the other map says at its centre, interpolated between the eight
-voxels around. Interpolated are square roots, with the sign: free space has been seen by many keyframes, and
-its sums would outweigh a wall of one voxel next to it. Where too little is known, nothing is added.
+keyframes. To it is added the other map's evidence at its centre, interpolated between the eight voxels
+around. Signed square roots are interpolated: free space has been seen by many keyframes, and its sums would
+outweigh a wall of one voxel next to it. Where too little is known, nothing is added.
 """
 
 from collections.abc import Iterator

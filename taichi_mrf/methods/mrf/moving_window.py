@@ -268,7 +268,7 @@ class MovingWindow:
         )
 
     def _seen_by_keyframes(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Which of some chunks (n, 3) are crossed by keyframes that are not frozen, (n,)."""
+        """True for chunks (n, 3) that rays of keyframes that are not frozen cross, (n,)."""
         registry, bricks = self._registry, _bricks_of(chunks)
         by_frozen = np.isin(grid_keys(bricks), grid_keys(registry.frozen_crossed))
         others = (registry.topology.crossings(bricks) > by_frozen).reshape(-1, CHUNK_BRICKS)

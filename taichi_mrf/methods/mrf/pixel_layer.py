@@ -58,7 +58,7 @@ class PixelLayer:
         return pixel_pass.PixelPass(self._sweeper, self._made)
 
     def of_some(self, keyframes: Mapping[int, Keyframe], pool: BrickPool, with_frozen: bool) -> "PixelLayer":
-        """What some keyframes gave, and perhaps frozen ones, by the beliefs of ``pool``."""
+        """The layer from some keyframes, and perhaps the frozen ones, by the beliefs of ``pool``."""
         parts = (self._registry, keyframes, self._sweeper, self._refresh, self._restore, pool)
         some = PixelLayer(self._name, *parts)
         some._frozen = self.frozen if with_frozen else some._frozen
@@ -107,7 +107,7 @@ class PixelLayer:
 
     @property
     def frozen(self) -> VoxelShare:
-        """What frozen keyframes gave to the voxels that there still are."""
+        """The share of frozen keyframes in the voxels that still exist."""
         if self._gone:
             gone, self._gone = grid_keys(np.concatenate(self._gone)), []
             self._frozen = self._frozen.chosen(~np.isin(grid_keys(self._frozen.bricks), gone))

@@ -202,9 +202,9 @@ def _covariance_of(id: int, pose_covariance: ArrayLike) -> Covariance:
 
 
 def _largest_motion_m(keyframe: Keyframe, T_world_camera: Pose) -> float:
-    """How far anything in a keyframe's view moves, at most, in metres, if it is moved to another pose: one of
-    the corners of the box around its bricks moves furthest. 0 only for the same pose, bit for bit, because
-    the order of inference follows from the bits."""
+    """Largest motion, in metres, of anything in a keyframe's view if it is moved to another pose: one of the
+    corners of the box around its bricks moves furthest. 0 only for the same pose, bit for bit, because the
+    order of inference follows from the bits."""
     if T_world_camera.tobytes() == keyframe.T_world_camera.tobytes():
         return 0.0
     footprint = keyframe.footprint

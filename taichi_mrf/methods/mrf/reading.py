@@ -27,7 +27,7 @@ def layer(
 ) -> MapReading:
     """MRFMap.layer."""
     if which not in LAYERS:
-        raise ConfigError(f"there is no layer {which!r}; known are {', '.join(LAYERS)}")
+        raise ConfigError(f"there is no layer {which!r}; choose from {', '.join(LAYERS)}")
     if which != "both" or stamp_s is not None:
         what = f"the {which} layer" if which != "both" else "the map of another time"
         dated = dates_for(parts, what)

@@ -1,8 +1,8 @@
 """Visibility-aware occupancy mapping: the baseline for stereo cameras.
 
-A measurement behind an occluding voxel is likely to be an error, so a voxel is updated only as far as it is
-visible in the map so far. In unknown space visibility ends after a few voxels, so the mapped space grows scan
-by scan.
+A measurement behind an occluding voxel is likely to be an error, so a voxel is updated only to the extent
+that it is visible in the map so far. In unknown space visibility ends after a few voxels, so the mapped space
+grows scan by scan.
 """
 
 import dataclasses
@@ -37,8 +37,8 @@ SCRATCH_BYTES = 12
 
 
 class VisibilityMap(RecursiveMap[Footprint]):
-    """A map that integrates scans as Schauwecker & Zell do (IROS 2014), by their Table I but for a growth
-    that reaches all of an image at once (VisibilityConfig.visible_if_occluded).
+    """A map that integrates scans as Schauwecker & Zell do (IROS 2014), with their Table I, except that it
+    grows to the extent of an image at once (VisibilityConfig.visible_if_occluded).
 
     The effect of a scan depends on the map before it, so the order of the keyframes matters.
     """

@@ -74,7 +74,7 @@ class SeenVoxels(Bundle):
 
 @dataclass(frozen=True)
 class RayLimits(Bundle):
-    """How far rays see (VisibilityConfig)."""
+    """Limits on the visibility of rays (VisibilityConfig)."""
 
     voxel_size: F32
     """Metres."""

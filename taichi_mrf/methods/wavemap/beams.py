@@ -122,7 +122,7 @@ class Beams(Bundle):
     metres."""
 
     number: I32
-    """How many entries are beams."""
+    """Number of entries that are beams."""
 
     near: F32
     """Radians around a direction in which there are usually NEIGHBOURS beams."""

@@ -51,7 +51,7 @@ NO_BEAM = -1
 """Stands for a beam where there are fewer than NEIGHBOURS."""
 
 WORTH_IT = 1.5
-"""How many times as wide a search must be for a narrower one to come first."""
+"""Least ratio of the widths of two searches for the narrower one to be tried first."""
 
 AT_SENSOR_M = 1e-4
 """A point nearer to the sensor than this has no direction."""
@@ -292,7 +292,7 @@ class WavemapMap(RecursiveMap[BeamFootprint]):
     ) -> None:
         """``parameters`` are fields of WavemapConfig, such as ``range_sigma=0.1`` or ``beams="nearest"``.
 
-        ``noise`` is not used: the model has a sigma of range of its own, the same at all ranges. Rays beyond
+        ``noise`` is not used: the model has its own sigma of range, the same at all ranges. Rays beyond
         ``max_depth`` show free space up to there. Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(wavemap, WavemapConfig, parameters, "wavemap", "WavemapMap")

@@ -285,7 +285,7 @@ def test_frames_that_see_different_things_tell_nothing(room: list[Frame]) -> Non
 def test_what_has_no_poses_is_refused(room: list[Frame]) -> None:
     dataset = of_frames(room)
     dataset.tracked = True
-    with pytest.raises(DatasetError, match="no poses that are recorded"):
+    with pytest.raises(DatasetError, match="no recorded poses"):
         diagnose(dataset)
 
 

@@ -217,7 +217,7 @@ def _scaling(experiment: Experiment, whole: Scene) -> "tuple[Table, Figure]":
         "OctoMap's are nodes, which stand for many equal voxels; it runs on one thread.",
     ]
     if not octomap_available():
-        notes.append("OctoMap is not installed: pip install 'taichi-mrf[bench]' brings it.")
+        notes.append("OctoMap is not installed: pip install 'taichi-mrf[bench]' adds it.")
     columns = ["voxels, resolution", "map", "seconds", "MB", "1000 known"]
     table = Table("stereo_fig5bc", "Figs. 5b, 5c: time and memory", columns, lines, notes, 3)
     return table, scaling_figure(results, methods)

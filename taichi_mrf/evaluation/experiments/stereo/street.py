@@ -33,8 +33,8 @@ is then visible with 0.4 * 0.5 + 0.5, which is q_max. The paper names this param
 the choice between speed of expansion and quality."""
 
 PASSES = 30
-"""How often the street is driven along where the visibility map grows as in the paper: with Table I it gains
-four unknown voxels an image at most, and their robot took 80 images on the way from one mapped pair to the
+"""Number of drives along the street where the visibility map grows as in the paper: with Table I it gains at
+most four unknown voxels per image, and the authors' robot took 80 images between one mapped pair and the
 next. Integrating a pair 30 times before the next one leaves three times as many artefacts."""
 
 STREET: Mapping[str, float] = {"surface_density": 0.07, "outlier_floor": 1e-2, "ray_density": 9.0 / 20.0}
