@@ -84,8 +84,8 @@ def is_stored(file: "NpzFile", prefix: str) -> bool:
 
 
 def read_stored(file: "NpzFile", prefix: str = "") -> Any:
-    """The object that :func:`stored_arrays` stored. Raises the file's error, also for a class that is neither of this
-    package nor imported."""
+    """The object that :func:`stored_arrays` stored. Raises the file's error, also for a class that is neither
+    of this package nor imported."""
     found, what = Arrays(file, prefix), prefix.rstrip("_") or "the noise"
     name = found.array(_KIND, "U", ()).item() if _KIND in found else None
     if name is not None and name not in KINDS:

@@ -273,7 +273,7 @@ def _swatches(named: Mapping[str, tuple[int, ...]]) -> str:
         f'<div style="display:inline-block"><span style="{swatch};background:rgb{color}"></span>{name}</div>'
         for name, color in named.items()
     )
-    return f'<div style="font-size:0.85em">{spans}</div>' if named else ""
+    return f'<div style="font-size:0.85em;padding-right:0.75em">{spans}</div>' if named else ""
 
 
 def probabilities() -> NDArray[np.float64]:
