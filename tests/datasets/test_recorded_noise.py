@@ -69,7 +69,7 @@ def test_a_range_that_was_set_stays_and_the_flag_is_named() -> None:
     near, dataset = Config(sensor=SensorConfig(max_depth=8.0)), street()
     assert with_recorded_noise(near, dataset).sensor.max_depth == 8.0
     assert dataset.notes[-1].startswith("50% of the measurements lie beyond sensor.max_depth, 8 m")
-    assert "--sensor.max-depth 40 those" in dataset.notes[-1]
+    assert "--sensor.max-depth 40 uses those" in dataset.notes[-1]
     few, right = street(share=0.05), street()
     with_recorded_noise(near, few)
     with_recorded_noise(with_recorded_noise(Config(), right), right)
