@@ -6,34 +6,19 @@ import colored_scene as scene
 import numpy as np
 import pytest
 from console import FAST, taichi_mrf
-from datasets_recordings import FORMATS, Content, write_image, write_rows
+from datasets_recordings import FORMATS, Content, write_image
 from label_layer import CLASSES, ENTRY, LABELS
-from numpy.typing import NDArray
+from label_recording import THING, WALL, write_scene
 from refusals import bad_frame
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.voxels.layers import LAYERS
 
-THING, WALL = 3, 7
-
 
 @pytest.fixture(autouse=True)
 def label_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LAYERS, LABELS, ENTRY)
-
-
-def write_scene(folder: Path) -> list[NDArray[np.uint8]]:
-    """The views of the scene in millimetres; returns their labels."""
-    found = []
-    for i, place in enumerate(scene.PLACES):
-        depth, color = scene.view(*place, seed=i)
-        found.append(np.where((color == scene.RED).all(axis=-1), THING, WALL).astype(np.uint8))
-        write_image(folder / "depth" / f"{i:05d}.png", np.rint(1000 * depth).astype(np.uint16))
-        write_image(folder / LABELS / f"{i:05d}.png", found[-1])
-    write_rows(folder / "poses.txt", [scene.pose(*place) for place in scene.PLACES])
-    (folder / "camera.txt").write_text("48 36 40 40 23.5 17.5")
-    return found
 
 
 def test_map_fills_the_layer(tmp_path: Path) -> None:
