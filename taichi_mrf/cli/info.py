@@ -36,6 +36,7 @@ from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file, is_folder
+from taichi_mrf.voxels.layers import pixel_layers
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS
 
 CANNOT_BE_MAPPED = 2
@@ -252,8 +253,8 @@ def print_map(console: Terminal, facts: Facts) -> None:
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
     if facts.get("free_space"):
         table.add_row("free space", facts["free_space"])
-    if "surface" in facts:
-        held = [name for name in ("colors", "surface") if facts[name]]
+    held = [*facts.get("pixel_layers", ()), *(["surface"] if facts.get("surface") else [])]
+    if held or "surface" in facts:
         table.add_row("also holds", " and ".join(held) or "neither colors nor surface")
     if facts.get("chunks_outside_window"):
         folder = folder_beside(Path(facts["map"])).name
@@ -272,6 +273,13 @@ def _run_map(path: Path) -> Facts:
         method = method_of(file)
         file.check()
         parked = len(file.array("parked", "U", (None,))) if "parked" in file else 0
+        beside = {image for keyframe in header.keyframes for image in keyframe.own.images}
+        beside |= {"color" for keyframe in header.keyframes if keyframe.color is not None}
+        fed = [
+            name
+            for name, made in pixel_layers().items()
+            if made.image in beside or name in file or f"{made.stored}_numbers" in file
+        ]
     names = [keyframe.name for keyframe in header.keyframes]
     stamps = [keyframe.stamp_s for keyframe in header.keyframes]
     return {
@@ -288,6 +296,7 @@ def _run_map(path: Path) -> Facts:
         "inferred": header.settled,
         "free_space": None if header.promise is None else header.promise.sentence(),
         "chunks_outside_window": parked,
+        "pixel_layers": fed,
         "configuration": _changed_parameters(header.config),
     }
 
@@ -303,6 +312,7 @@ def _chunked_map(path: Path) -> Facts:
         "up": m.header.up or None,
         "colors": m.has_colors,
         "surface": m.has_surface,
+        "pixel_layers": list(m.pixel_layers),
         "configuration": _changed_parameters(m.config),
     }
 

@@ -14,11 +14,13 @@ in memory).
 import importlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, by_chunk, grid_keys, split_bricks
 
 Chunk = tuple[int, int, int]
@@ -46,7 +48,7 @@ class FromPixels:
     pixel, all 0 where it says nothing. ``visitor`` is the module and the class of its PixelVisitor, loaded
     when a map is first asked for the layer. A voxel's sums are int64 ``words``, each of which holds two
     numbers; ``stored`` and the words' names are those of what frozen keyframes gave, in files. ``page`` is
-    its display.
+    its display. No two layers have the same image, ``stored`` or colouring.
     """
 
     image: str
@@ -110,8 +112,17 @@ LAYERS = {
 
 
 def pixel_layers() -> dict[str, FromPixels]:
-    """The layers that pixels feed."""
-    return {name: layer.from_pixels for name, layer in LAYERS.items() if layer.from_pixels is not None}
+    """The layers that pixels feed. Raises ConfigError if two share an image, ``stored`` or a colouring."""
+    made = {name: layer.from_pixels for name, layer in LAYERS.items() if layer.from_pixels is not None}
+    for field in ("image", "stored", "page.coloring"):
+        first: dict[str, str] = {}
+        for name, each in made.items():
+            value = attrgetter(field)(each)
+            if (other := first.setdefault(value, name)) != name:
+                raise ConfigError(
+                    f"layers {other} and {name}: both have {field} {value!r}; each needs its own"
+                )
+    return made
 
 
 @dataclass(frozen=True)

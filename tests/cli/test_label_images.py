@@ -1,39 +1,27 @@
 """Images beside depth in a folder's recording fill the layer that their folder is named after, by `map`."""
 
+import json
+import re
 from pathlib import Path
 
 import colored_scene as scene
 import numpy as np
 import pytest
 from console import FAST, taichi_mrf
-from datasets_recordings import FORMATS, Content, write_image, write_rows
+from datasets_recordings import FORMATS, Content, write_image
 from label_layer import CLASSES, ENTRY, LABELS
-from numpy.typing import NDArray
+from label_recording import THING, WALL, write_scene
 from refusals import bad_frame
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.export.formats import export_map
 from taichi_mrf.methods.registry import load_map
-from taichi_mrf.voxels.layers import LAYERS
-
-THING, WALL = 3, 7
+from taichi_mrf.voxels.layers import COLORS, LAYERS
 
 
 @pytest.fixture(autouse=True)
 def label_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LAYERS, LABELS, ENTRY)
-
-
-def write_scene(folder: Path) -> list[NDArray[np.uint8]]:
-    """The views of the scene in millimetres; returns their labels."""
-    found = []
-    for i, place in enumerate(scene.PLACES):
-        depth, color = scene.view(*place, seed=i)
-        found.append(np.where((color == scene.RED).all(axis=-1), THING, WALL).astype(np.uint8))
-        write_image(folder / "depth" / f"{i:05d}.png", np.rint(1000 * depth).astype(np.uint16))
-        write_image(folder / LABELS / f"{i:05d}.png", found[-1])
-    write_rows(folder / "poses.txt", [scene.pose(*place) for place in scene.PLACES])
-    (folder / "camera.txt").write_text("48 36 40 40 23.5 17.5")
-    return found
 
 
 def test_map_fills_the_layer(tmp_path: Path) -> None:
@@ -52,6 +40,35 @@ def test_map_fills_the_layer(tmp_path: Path) -> None:
     assert 0 < is_thing.sum() < seen.sum()
     right = values[seen].argmax(axis=-1) + 1 == np.where(is_thing, THING, WALL)
     assert right.mean() > 0.95
+
+
+def test_info_names_the_layers_of_saved_maps(tmp_path: Path) -> None:
+    pytest.importorskip("zarr", reason="maps in chunks need the extra store")
+    m = scene.build([0])
+    view, place = scene.view(0.0, seed=1)[0], scene.pose(0.0)
+    names = {"colors": [COLORS], "both": [COLORS, LABELS], "labels": [LABELS]}
+    for kind, held in names.items():
+        if kind == "both":
+            m.add_keyframe(
+                view, place, scene.CAMERA, images={LABELS: np.full(scene.CAMERA.shape, THING, np.uint8)}
+            )
+        elif kind == "labels":
+            m.remove_keyframe(next(iter(m.keyframes)))
+        m.infer()
+        m.save(tmp_path / f"{kind}.npz")
+        export_map(m, tmp_path / f"{kind}.zarr")
+        for suffix in ("npz", "zarr"):
+            path = tmp_path / f"{kind}.{suffix}"
+            facts = json.loads(taichi_mrf("info", path, "--json").stdout)
+            assert facts["pixel_layers"] == held
+            assert facts.get("colors", COLORS in held) == (COLORS in held)
+            said = taichi_mrf("info", path).stdout
+            assert re.search(rf"also holds +\S {' and '.join(held)} ", said), said
+    m.freeze_keyframe(next(iter(m.keyframes)))  # which leaves sums, and no image
+    m.save(tmp_path / "frozen.npz")
+    assert json.loads(taichi_mrf("info", tmp_path / "frozen.npz", "--json").stdout)["pixel_layers"] == [
+        LABELS
+    ]
 
 
 @pytest.mark.parametrize("name", FORMATS)

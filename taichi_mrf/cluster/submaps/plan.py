@@ -26,7 +26,7 @@ from taichi_mrf.datasets.own_body import OwnBody
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.geometry.up import Z_UP, Up
 from taichi_mrf.system.atomic import write_text
-from taichi_mrf.voxels.layers import COLORS, FIRST, SURFACE
+from taichi_mrf.voxels.layers import FIRST, SURFACE, pixel_layers
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 Cell = tuple[int, int]
@@ -41,12 +41,14 @@ FREE_TO_DIFFER = ("runtime.", "volume.memory_limit_gb")
 @dataclass(frozen=True)
 class SeenFrame:
     """Part of a keyframe that the plan needs: its index in the dataset, where the camera was, in metres, and
-    the chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image."""
+    the chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image, ``images`` are
+    the names of its images beside depth and colour."""
 
     index: int
     centre_m: tuple[float, float, float]
     chunks: NDArray[np.int32]
     up: Up = Z_UP
+    images: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,8 @@ class SourceFrames:
 class Job:
     """A sequence, how it is mapped, and how it is cut. ``skipped`` has the problem of each unreadable frame
     by name; ``centres_m`` are the camera centres of all keyframes, by their index in the dataset;
-    ``up`` is the name of the world axis that is up, empty in plans of earlier versions."""
+    ``up`` is the name of the world axis that is up, ``images`` are the names of the keyframes' images beside
+    depth and colour; both empty in plans of earlier versions."""
 
     sequence: SourceFrames
     config: Config
@@ -145,12 +148,14 @@ class Job:
     centres_m: dict[int, tuple[float, float, float]]
     skipped: dict[str, str]
     up: str = ""
+    images: tuple[str, ...] = ()
 
     @property
     def layers(self) -> tuple[str, ...]:
         """The layers of the map beside log-odds."""
-        measured = (SURFACE, FIRST) if self.config.keep_surface else ()
-        return (COLORS, *measured) if self.config.color else measured
+        images = {*self.images, "color"} if self.config.color else {*self.images}
+        fed = (name for name, made in pixel_layers().items() if made.image in images)
+        return (*fed, SURFACE, FIRST) if self.config.keep_surface else (*fed,)
 
     def write(self, folder: Path) -> None:
         """Write the plan's file. Raises MapFileError."""
@@ -162,6 +167,7 @@ class Job:
             "centres_m": self.centres_m,
             "skipped": self.skipped,
             "up": self.up,
+            "images": self.images,
             "plan": plan,
         }
         write_text(folder / PLAN_FILE, json.dumps(content) + "\n")
@@ -182,6 +188,7 @@ class Job:
                 {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
                 content["skipped"],
                 content.get("up", ""),
+                tuple(content.get("images", ())),
             )
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise MapFileError(f"{path}: not a readable plan of submaps: {said(error)}") from error

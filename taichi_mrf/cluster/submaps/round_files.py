@@ -141,7 +141,7 @@ def read_layer(path: Path, name: str) -> BrickValues:
                 "with more --rounds makes them"
             )
         bricks, layer = _bricks(file, f"{name}_bricks"), LAYERS[name]
-        values = file.array(f"{name}_values", "uf", (len(bricks), VOXELS, *layer.shape))
+        values = file.array(f"{name}_values", "iuf", (len(bricks), VOXELS, *layer.shape))
         return BrickValues(bricks, values.astype(layer.dtype))
 
 

@@ -156,7 +156,8 @@ def _job(
     )
     plan = plan_submaps(keyframes, submap_size, config.voxel_size)
     centres_m = {k.index: k.centre_m for k in keyframes}
-    job = Job(sequence, config, submap_size, plan, centres_m, skipped, up_name(keyframes[0].up))
+    images = tuple(sorted({name for k in keyframes for name in k.images}))
+    job = Job(sequence, config, submap_size, plan, centres_m, skipped, up_name(keyframes[0].up), images)
     job.write(folder)
     return job
 

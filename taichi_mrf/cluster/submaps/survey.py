@@ -37,7 +37,7 @@ class SurveyTask:
 class SurveyedFrame:
     """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, even one
     that no ray is cast for; ``problem``: why it could not be read; ``up``: its upward axis; ``sensor``:
-    Frame.sensor."""
+    Frame.sensor; ``images``: names of Frame.images."""
 
     index: int
     name: str
@@ -47,6 +47,7 @@ class SurveyedFrame:
     problem: str | None = None
     up: Up = Z_UP
     sensor: str = ""
+    images: tuple[str, ...] = ()
 
 
 def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
@@ -72,8 +73,8 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
                 bricks = np.concatenate([bricks, m.measured_bricks()])
             chunks = np.unique(bricks // CHUNK, axis=0)
             m.remove_keyframe(id)
-        up = up_of(T_world_camera, frame.camera.up)
-        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured, up=up, sensor=frame.sensor))
+        read = up_of(T_world_camera, frame.camera.up), frame.sensor, tuple(frame.images)
+        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured, None, *read))
     return found
 
 
@@ -125,5 +126,5 @@ def _chosen(
             if len(frame.chunks):  # else no ray is cast for it
                 T = frame.T_world_camera
                 x, y, z = T[:3, 3].tolist()
-                keyframes.append(SeenFrame(frame.index, (x, y, z), frame.chunks, frame.up))
+                keyframes.append(SeenFrame(frame.index, (x, y, z), frame.chunks, frame.up, frame.images))
     return keyframes, skipped

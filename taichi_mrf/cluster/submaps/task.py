@@ -30,7 +30,7 @@ from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.queries.points import probability
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
-from taichi_mrf.voxels.layers import COLORS, FIRST, SURFACE, BrickValues
+from taichi_mrf.voxels.layers import FIRST, SURFACE, BrickValues
 from taichi_mrf.voxels.layout import grid_keys
 
 MOVED = 0.01
@@ -40,7 +40,7 @@ MOVED = 0.01
 @dataclass(frozen=True)
 class SubmapTask:
     """Infer a submap of the plan in ``folder`` in a round, 0 being the one before any exchange. In a round
-    that ``may_be_last`` colours and surface are made too, if the parameters ask for them."""
+    that ``may_be_last`` the other layers of the map (Job.layers) are made too."""
 
     folder: str
     submap: int
@@ -133,9 +133,8 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
 
 def _layers(m: PartialMap, job: Job, task: SubmapTask, core: Bricks) -> dict[str, BrickValues]:
     """The layers of the core that are wanted beside log-odds."""
-    found, slots = {}, m.slots(core)
-    if COLORS in job.layers:
-        found[COLORS] = BrickValues(core, m.colors_in(slots))
+    slots, fed = m.slots(core), m.pixel_layers
+    found = {name: BrickValues(core, fed[name].within(slots)) for name in job.layers if name in fed}
     if SURFACE in job.layers:
         field = m.surface_field()
         rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.viewer.scene.widgets import image_html
@@ -171,7 +172,10 @@ def _chance_marks(low: float, high: float) -> tuple[str, ...]:
 
 
 def _of_pixels(layer: str, page: OnPage) -> Coloring:
-    """The colouring of a layer that pixels feed. Vertices have colours alone of their own."""
+    """The colouring of a layer that pixels feed. Vertices have colours alone of their own. Raises ConfigError
+    for a name that a colouring without layer has."""
+    if page.coloring in _FIRST or page.coloring in _LAST:
+        raise ConfigError(f"layer {layer}: has page.coloring {page.coloring!r}, which is the page's own")
 
     def painted(known: Any, points_m: Floats, up: Floats) -> NDArray[np.uint8]:
         found = known.colors if layer == COLORS else known.layers.get(layer)
@@ -191,7 +195,7 @@ _HEIGHT = Measure(
 )
 _PLAIN = Measure("", lambda known, points_m, up: np.full(points_m.shape, NO_COLOR, np.uint8))
 
-COLORINGS: dict[str, Coloring] = {
+_FIRST = {
     "height": Coloring("how high it is above its lowest surface.", _HEIGHT, _HEIGHT),
     "marginal probability": Coloring(
         "how sure the map is that a voxel is occupied: orange where it is unsure, blue where it is sure.",
@@ -215,7 +219,8 @@ COLORINGS: dict[str, Coloring] = {
             logarithmic=True,
         ),
     ),
-    **{made.page.coloring: _of_pixels(name, made.page) for name, made in pixel_layers().items()},
+}
+_LAST = {
     "keyframes that see it": Coloring(
         "how many keyframes have rays through the voxel.",
         voxels=Measure(
@@ -229,6 +234,9 @@ COLORINGS: dict[str, Coloring] = {
     ),
     "plain grey": Coloring("nothing, so that what moves and what changed stands out.", _PLAIN, _PLAIN),
 }
+_BY_PIXELS = {made.page.coloring: _of_pixels(name, made.page) for name, made in pixel_layers().items()}
+
+COLORINGS: dict[str, Coloring] = {**_FIRST, **_BY_PIXELS, **_LAST}
 """All colourings by name; the first is that of a new page."""
 
 
