@@ -123,7 +123,7 @@ class MapScene:
         return sum(layer.voxels_shown for layer in self.layers.values())
 
     def counts(self) -> dict[str, int]:
-        """How many of what is shown, or will be once all is sent, by name; ``voxels``: also behind a surface."""
+        """How many of what is shown, or will be, by name; ``voxels`` also behind a surface."""
         counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
         counts |= {"voxels": counts["map"], "dynamic": self.layers["map"].dynamic_shown}
         if self.shows_surface or not self._options.map:
