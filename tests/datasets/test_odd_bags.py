@@ -197,7 +197,7 @@ def slow(bag: Bag) -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[Bag], object], list[str]]] = {
-    "encodings": (other_kinds, ["/jet (bgr8), /range (mono16). ?depth=/range takes"]),
+    "encodings": (other_kinds, ["/jet (bgr8), /range (mono16). ?depth=/range reads"]),
     "millimetres": (
         lambda bag: but(bag, image=lambda i: steps(i).astype(np.float32), encoding="32FC1"),
         ["too much for metres: pass --depth-scale 1000"],
