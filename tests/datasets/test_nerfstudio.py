@@ -177,7 +177,7 @@ def test_entries_that_are_wrong_are_named(entries: dict[str, Any], problem: str,
 @pytest.mark.parametrize(
     ("entries", "problem"),
     [
-        ({"depth_file_path": 7}, "frames[1]: a path is a text"),
+        ({"depth_file_path": 7}, "frames[1]: a path must be text"),
         ({"k1": 0.2}, "its frames have different lenses"),
     ],
 )
