@@ -202,7 +202,7 @@ def test_it_is_loaded_as_if_all_keyframes_had_been_frozen(stores: dict[str, Path
 
 
 def test_one_without_such_evidence_is_not_loaded(stores: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match=r"log_odds\.zarr: maps of the method mrf"):
+    with pytest.raises(MapFileError, match=r"log_odds\.zarr: only maps of the method mrf"):
         load_map(stores["log_odds"])
     dated = MRFMap(0.1, time=TimeConfig(half_life_s=10.0))
     dated.add_keyframe(np.full((40, 40), 1.0, np.float32), np.eye(4), PinholeCamera(40, 40, 40, 40, 20, 20))
