@@ -205,7 +205,7 @@ def test_images_without_measurements_are_an_error(tables: Tables) -> None:
 
     with pytest.raises(DatasetError, match="none of the 3 depth images contains a measurement"):
         calibrate(Blank(tables, 3, 1, 2), CAMERA, CalibrationConfig())
-    with pytest.raises(DatasetError, match=r"in none of 3 images .* from 8 to 9 m"):
+    with pytest.raises(DatasetError, match=r"no pixel of the 3 images .* from 8 to 9 m"):
         calibrate(Planes(tables, 3, 1, 2), CAMERA, CalibrationConfig(min_depth=8, max_depth=9))
 
 
