@@ -55,12 +55,13 @@ def following(link: FakeLink, told: Told, method: str = "mrf") -> Session:
 
 def test_keyframes_move_when_the_poses_change_and_the_map_is_that_of_the_last_poses() -> None:
     link, told = FakeLink(), Told()
-    first = {1: shifted(1, 0.05), 2: shifted(2, 0.0, 0.1)}
+    there = {3: shifted(3)}  # without a pose it would be carried along with the one before it
+    first = {1: shifted(1, 0.05), 2: shifted(2, 0.0, 0.1), **there}
     told.tell(first)
     session = following(link, told)
     assert marginals(finished(session)) == marginals(small_room.build(range(4), first))
     last = {0: shifted(0, 0.3, 0.0, 0.0), 1: shifted(1, 0.0, 0.2, 0.0), 2: shifted(2, 0.0, 0.1, 1e-5)}
-    told.tell(last)
+    told.tell(last | there)
     link.sent.clear()
     assert marginals(finished(session)) == marginals(small_room.build(range(4), last))
     assert link.errors() == []
