@@ -1,6 +1,7 @@
 """A robot that sends a bag, what a client of its wire hears, and frames made of it, which are the bag's."""
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ SECONDS = 20
 
 
 @dataclass
-class Sender:
+class Sender(ABC):
     """A robot that runs in a ``with`` block, and is stopped at its end; its kind says how it sends.
     ``messages`` are (topic, time of recording in nanoseconds, bytes) in order."""
 
@@ -35,16 +36,17 @@ class Sender:
     def __exit__(self, *error: object) -> None:
         self.stop()
 
+    @abstractmethod
     def stop(self) -> None:
-        raise NotImplementedError
+        """End it."""
 
+    @abstractmethod
     def listened(self) -> set[str]:
         """The topics that somebody listens to."""
-        raise NotImplementedError
 
+    @abstractmethod
     def put(self, topic: str, time_ns: int, data: bytes) -> None:
         """Send one message."""
-        raise NotImplementedError
 
     def wait_for(self, *topics: str) -> None:
         """Wait until somebody listens to some topics."""
